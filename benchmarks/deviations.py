@@ -173,7 +173,7 @@ def d5() -> Figures:
 
 
 def d7() -> Figures:
-    """Policies that work out resolved velocities at smoothed angles, and at the newest ones."""
+    """Policies that read the newest angles, also for resolved velocities, and smoothed ones."""
     with mock.patch.object(interface, "smooth_angles", lambda _, history: history[..., 0, -1]):
         newest_angles = train(STEPS)
     return compare(newest_angles=newest_angles, ours=default_training())

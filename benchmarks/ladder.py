@@ -33,7 +33,7 @@ FIGURES = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "jerk_rm
 STEPS = {
     "groups": "groups of rollouts, not a critic",
     "nets": "rich excitation, multi-step fit, nets read what a command opens",
-    "observation": "error integral, resolved rates, open valves",
+    "observation": "half of the history, error integral, resolved rates, open valves",
     "command": "actions from the dead zone on, closed valves at rest",
     "cost": "costs of valve travel and error integral",
     "settings": "our settings of task and learner, and Muon",

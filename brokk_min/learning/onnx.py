@@ -10,11 +10,11 @@ from brokk_min.learning.policy import INTERFACES, Policy, contract
 from brokk_min.machine import Machine
 
 OBSERVATION = (
-    "goal and measured velocity of the tool [m/s], angles of locked joints [rad or m]; interface "
-    "paper: histories of angles and of velocities of each driven joint, then of its command for "
-    "each driven joint [of full command], newest sample last; interface beyond: mean angles of "
-    "driven joints, newer halves of the histories of their velocities, then commands, then open "
-    "indicators, then resolved velocities of goal and error integral; less mean, over scale"
+    "each number less mean, over scale, newest samples last: goal and measured velocity of the "
+    "tool [m/s], angles of locked joints [rad or m]; interface paper: histories of angles and of "
+    "velocities of each driven joint, then of its command for each driven joint [of full command]; "
+    "interface beyond: smoothed angles of driven joints, newer halves of the histories of their "
+    "velocities, then commands, then open indicators, resolved velocities of goal and integral"
 )
 
 

@@ -54,7 +54,7 @@ def test_smooth_angles__are_the_angles_of_steady_motion_and_of_constant_accelera
 
 
 def test_observe__by_hand():
-    """Of the paper's numbers the newer half by their weights; and the blocks of ours."""
+    """Smoothed angles, the newer half of the paper's samples by their weights, our own blocks."""
     integral = (0.02, -0.01, 0.03)
     v_goal = np.array([0.3, -0.1, -0.15], np.float32)
     measured = measure(BROKK_170, numbered_history(), v_goal)
@@ -92,9 +92,7 @@ def test_the_table_of_the_docstring__is_true():
     q_dot = env.velocity_deviations(BROKK_170)[1][DRIVEN]
     samples = [np.repeat(q_dot, 6), std[-24:], np.full(24, 0.5)]
     deviations = np.concatenate([std[:7], std[7:111:26], *samples, q_dot, 0.1 * q_dot])
-    assert [int(last) + 1 for _, last, _ in rows] == [7, 11, 35, 59, 83, 87, 91] and len(
-        scale
-    ) == 91
+    assert [int(last) + 1 for _, last, _ in rows] == [7, 11, 35, 59, 83, 87, len(scale)]
     assert all(int(one[1]) + 1 == int(next_[0]) for one, next_ in pairwise(rows))
     for first, last, weight in rows:
         step = 6 if int(last) - int(first) == 23 else 1
@@ -102,19 +100,19 @@ def test_the_table_of_the_docstring__is_true():
         np.testing.assert_allclose(deviations[place] / scale[place], float(weight), atol=5e-4)
 
 
-@given(machines())
-def test_scale__of_any_machine_lets_the_samples_of_a_signal_weigh_as_one_number(machine):
-    """Velocities, commands, indicators: the samples of the newer half have sum w^2 = 1."""
+@given(machines(), st.integers(4, 40))
+def test_scale__of_any_machine_lets_the_samples_of_a_signal_weigh_as_one_number(machine, history):
+    """Velocities, commands, indicators: those of the newer half have sum w^2 = 1 and fade."""
+    machine = replace(machine, name=f"{machine.name}, {history}", history=history)
     n, half, first = len(machine.driven), machine.history // 2, 6 + len(machine.locked)
     mean, scale = observation_scale(machine)
     assert mean.shape == scale.shape == (first + n + 3 * n * half + 2 * n,)
-    q_dot, u = (
-        env.velocity_deviations(machine)[1][machine.driven],
-        env.observation_scale(machine)[1][-1],
-    )
+    q_dot = env.velocity_deviations(machine)[1][machine.driven]
+    u = env.observation_scale(machine)[1][-1]
     std = np.repeat([*q_dot, *np.full(n, u), *np.full(n, 0.5)], half)
     weights = (std / scale[first + n : -2 * n]).reshape(3 * n, half)
     np.testing.assert_allclose((weights**2).sum(axis=1), 1, rtol=1e-4)
+    np.testing.assert_allclose(weights[:, -2] / weights[:, -1], np.exp(-6.5 / history), rtol=1e-4)
 
 
 @given(machines(), st.floats(-0.02, 0.02) | st.floats(-2, 2))

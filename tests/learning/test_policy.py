@@ -50,7 +50,7 @@ def test_act__refuses_wrong_shapes_and_what_is_not_finite():
 
 @pytest.mark.parametrize("kind", ["paper", "beyond"])
 def test_controller__remembers_how_long_its_goal_is_zero(kind):
-    """Valves of our agent close after a tenth of a second; the paper's go on."""
+    """Valves of our agent close after 0.1 s of a zero goal; the paper's go on."""
     controller = PolicyController(BROKK_170, policy(kind))
     memory = controller.start(2)
     goals = np.array([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0]])
