@@ -32,7 +32,7 @@ from brokk_min.machine import BROKK_170 as M
 FIGURES = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "jerk_rms")
 STEPS = {
     "groups": "groups of rollouts, not a critic",
-    "nets": "rich excitation, multi-step fit, nets read what a command opens",
+    "nets": "rich excitation, multi-step fit, five nets a joint that read what a command opens",
     "observation": "half of the history, error integral, resolved rates, open valves",
     "command": "actions from the dead zone on, closed valves at rest",
     "cost": "costs of valve travel and error integral",

@@ -18,7 +18,7 @@ from brokk_min._files import one_line
 COMMANDS = {  # module and class in `cli`, and what the command does
     "collect": ("identification", "Collect", "record a machine under excitation"),
     "inspect": ("identification", "Inspect", "what a log tells; with --net, errors of nets on it"),
-    "fit": ("identification", "Fit", "fit one net per joint to logs, and score them"),
+    "fit": ("identification", "Fit", "fit nets of each joint to logs, and score them"),
     "train": ("training", "Train", "train a policy on the nets"),
     "evaluate": ("evaluation", "Evaluate", "policies and baselines on the same sequences"),
     "reproduce": ("evaluation", "Reproduce", "the whole chain, the paper's figures, one report"),

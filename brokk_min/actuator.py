@@ -197,15 +197,19 @@ class ActuatorNet:
 
         `history` is of `append_command`, (..., n, 3, H).
         """
-        w1, b1, w2, b2, w3, b3 = self.weights
         x = (self.inputs(history) - self.input_mean) / self.input_scale
         x = x.reshape(-1, *x.shape[-2:]).swapaxes(0, 1)  # (n, batch, I): one product per joint
-        x = np.maximum(x @ w1 + b1[:, None], 0)
-        x = np.maximum(x @ w2 + b2[:, None], 0)
-        z = np.maximum(x @ w3 + b3[:, None], -80)  # exp(80) does not overflow
-        y = 1 / (1 + np.exp(-z))[..., 0].T
+        y = self.outputs(x).T
         velocity = self.output_low + (self.output_high - self.output_low) * y
         return np.asarray(velocity.reshape(history.shape[:-2]))
+
+    def outputs(self, x: Array) -> Array:
+        """Sigmoid outputs (n, batch) of standardised inputs (n, batch, I)."""
+        w1, b1, w2, b2, w3, b3 = self.weights
+        x = np.maximum(x @ w1 + b1[..., None, :], 0)
+        x = np.maximum(x @ w2 + b2[..., None, :], 0)
+        z = np.maximum(x @ w3 + b3[..., None, :], -80)  # exp(80) does not overflow
+        return np.asarray(1 / (1 + np.exp(-z))[..., 0])
 
     def reset(self, machine: Machine, q: ArrayLike) -> NetState:
         """The nets as a `Plant`, at rest at angles `q` [rad] (..., n)."""

@@ -104,7 +104,7 @@ class Inspect(ReadsLogs):
 
 @dataclass(kw_only=True)
 class Fit(ReadsLogs):
-    """Fit one net per joint to logs of any machine; score them on other recordings."""
+    """Fit nets of each joint to logs of any machine; score them on other recordings."""
 
     logs: Positional[tuple[Path, ...]]  # Of one machine: .csv, .npz, of ROS, or of a CAN bus.
     out: Path  # Nets to write, .npz.

@@ -15,8 +15,9 @@ class FitConfig:
     hidden: int = 32  # units in each of the two hidden layers (paper: 32)
     rollout: int = 8  # ticks of the errors in the last third of the steps (paper: 1)
     valve: bool = True  # do the nets read what a command opens (beyond.valve_nets)? (paper: no)
+    members: int = 5  # nets a joint, whose mean counts (beyond.net_ensemble) (paper: 1)
     newest_only: bool = False  # do they read commands and the newest angle and velocity alone?
 
 
-PAPER_RECIPE: dict[str, Any] = {"rollout": 1, "valve": False}
+PAPER_RECIPE: dict[str, Any] = {"rollout": 1, "valve": False, "members": 1}
 """Sec. 3.3: errors of one step, commands as they are."""

@@ -1,4 +1,4 @@
-"""Fitting one actuator net per joint to a log.
+"""Fitting actuator nets to a log, one for each joint or several.
 
 The fit minimises the error of one step first, and then the errors that add up over several steps of
 the nets on their own outputs, because there a bias adds up and the noise of encoders does not. The
@@ -20,6 +20,7 @@ from torch import Generator, Tensor
 from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet
+from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
@@ -30,17 +31,21 @@ __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
 
 
 def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = "") -> ActuatorNet:
-    """Fit one net per joint to a log. Paper: Sec. 3.3 (MSE, Adam)
+    """Fit the nets of each joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
-    `seed` repeats the nets to the bit on one computer. `machine` has the history, the window of the
-    estimator that made the velocities of `log`, and the dead zones. `name` is its name in the file;
-    it is empty for a log with other joints, whose nets read the commands as they are.
-    ValueError: a joint that never moves long enough, or weights that are not finite at the end.
+    The same `seed` gives the same bits on one computer. `machine` has the history, the window of
+    the estimator that made the velocities of `log`, and the dead zones. `name` is its name in the
+    file; it is empty for a log with other joints, whose nets read the commands as they are.
+    ValueError: a joint that never moves long enough, weights that are not finite at the end, or
+    several members of nets that read the commands as they are.
     """
-    config = replace(config, valve=config.valve and bool(name))
+    if not name:
+        config = replace(config, valve=False, members=1)
+    require(config.valve or config.members == 1, "members", "1 of nets as printed", config.members)
     index = [machine.names.index(joint) for joint in log.joints] if name else []
     data = training_set(log, config, machine, machine.dead_zones[index].astype(np.float32))
-    weights = train(data, config, seed)
+    seeds = range(seed * config.members, (seed + 1) * config.members)
+    members = [train(data, config, one) for one in seeds]
     fields: dict[str, Any] = {
         "joints": log.joints,
         "history": machine.history,
@@ -49,12 +54,15 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
         "velocity_logged": log.velocity_logged,
         "machine": name,
         "training": {"seed": seed, "settings": asdict(config)},
-        "weights": tuple(weight.detach().numpy() for weight in weights),
         **{key: getattr(data, key).numpy() for key in ARRAYS},
     }
     if data.zones is None:
-        return ActuatorNet(**fields)
-    return ValveNet(**fields, dead_zones=data.zones.numpy())
+        return ActuatorNet(**fields, weights=members[0])
+    zones = data.zones.numpy()
+    if config.members == 1:
+        return ValveNet(**fields, weights=members[0], dead_zones=zones)
+    weights = tuple(np.stack(of, axis=1) for of in zip(*members, strict=True))
+    return NetEnsemble(**fields, weights=weights, dead_zones=zones)
 
 
 @dataclass(frozen=True)
@@ -122,8 +130,8 @@ def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) ->
     )
 
 
-def train(data: TrainingSet, config: FitConfig, seed: int) -> list[Tensor]:
-    """Weights of all nets, as in `ActuatorNet.weights`."""
+def train(data: TrainingSet, config: FitConfig, seed: int) -> tuple[Array, ...]:
+    """Weights of one net for each joint, as in `ActuatorNet.weights`."""
     torch.set_num_threads(1)  # several wait in vain on busy cores
     generator = Generator().manual_seed(seed)
     weights = initial_weights(data, config, generator)
@@ -145,7 +153,7 @@ def train(data: TrainingSet, config: FitConfig, seed: int) -> list[Tensor]:
         optimizer.step()
     if not all(bool(torch.isfinite(weight).all()) for weight in weights):
         raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
-    return weights
+    return tuple(weight.detach().numpy() for weight in weights)
 
 
 def initial_weights(data: TrainingSet, config: FitConfig, generator: Generator) -> list[Tensor]:

@@ -11,13 +11,14 @@ import numpy as np
 
 from brokk_min._files import expected, load_arrays, located, save_arrays
 from brokk_min.actuator import ActuatorNet
+from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.machine import Array, Machine, require
 
 KIND = "actuator net 4"
 HEADER = ("joints", "history", "rate", "velocity_samples", "velocity_logged", "machine", "training")
 ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
-CLASSES = {"paper": ActuatorNet, "valve": ValveNet}  # the names of what nets read, in files
+CLASSES = {"paper": ActuatorNet, "valve": ValveNet, "ensemble": NetEnsemble}  # by name in files
 NAMES = {kind: name for name, kind in CLASSES.items()}
 
 
@@ -42,7 +43,7 @@ def net_from_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, 
         fields |= {name: arrays[name] for name in ARRAYS}
         fields["joints"] = tuple(header["joints"])
         fields["weights"] = tuple(arrays[f"weight_{i}"] for i in range(6))
-        if header["reads"] == "valve":
+        if "dead_zones" in arrays:
             fields["dead_zones"] = arrays["dead_zones"]
         net = CLASSES[header["reads"]](**fields)
         net.predict(np.zeros((1, len(net.joints), 3, net.history), np.float32))  # do shapes fit?

@@ -22,7 +22,7 @@ def find_recipe(paper: bool = False, critic: bool = False) -> Recipe:
     if critic:
         learner = PPOConfig()
     elif paper:
-        learner = PPOConfig(80_000_000, gamma=0.95, gae_lambda=1.0, log_std_end=-4.2)
+        learner = PPOConfig(75_000_000, gamma=0.95, gae_lambda=1.0, log_std_end=-4.2)
     else:
         learner = PPOConfig(
             11_000_000,

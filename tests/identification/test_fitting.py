@@ -73,6 +73,20 @@ def test_fit__states_how_the_nets_were_fitted():
     np.testing.assert_allclose(paper.input_mean[:, 30], u[8:].mean(axis=0), atol=0.1)
 
 
+def test_fit__gives_each_member_of_an_ensemble_a_seed_of_its_own():
+    """Three nets by seed 2 are those of seeds 6, 7 and 8 alone."""
+    log = simple_system(0, 2, 60)._replace(joints=("q4", "q1"))
+    config = replace(CONFIG, steps=3, members=3)
+    ensemble = fit(log, config, 2, BROKK_170, "brokk170")
+    for k, seed in enumerate((6, 7, 8)):
+        alone = fit(log, replace(config, members=1), seed, BROKK_170, "brokk170")
+        assert type(alone) is ValveNet
+        for one, every in zip(alone.weights, ensemble.weights, strict=True):
+            np.testing.assert_array_equal(one, every[:, k])
+    with pytest.raises(ValueError, match="members: expected 1 of nets as printed, got 3"):
+        fit(log, replace(config, valve=False), 0, BROKK_170, "brokk170")
+
+
 def test_fit__uses_one_step_errors_where_recordings_are_too_short_for_more():
     log = Log(("a",), tuple(line(f"r{i}", 0.0, 0.1 * i, 15) for i in range(4)))
     config = FitConfig(steps=5, batch_size=8, rollout=8)
@@ -83,7 +97,7 @@ def test_fit__uses_one_step_errors_where_recordings_are_too_short_for_more():
 
 def test_fit__has_nets_that_read_the_newest_outputs_and_all_commands():
     """No older angle or velocity changes what they predict after the fit."""
-    config = FitConfig(10, batch_size=16, newest_only=True, valve=False)
+    config = FitConfig(10, batch_size=16, newest_only=True, valve=False, members=1)
     net = fit(simple_system(0, 3, 60), config, 0, BROKK_170)
     history = np.random.default_rng(0).uniform(-1, 1, (200, 2, 3, 13)).astype(np.float32)
     before = net.predict(history)
@@ -123,7 +137,7 @@ def test_accumulated_loss__is_the_error_of_a_free_run(logged, valve):
     """Three ticks on the nets' own outputs, stops included; the first is the one-step loss."""
     log = simple_system(0, 4, logged=logged)
     log = log._replace(joints=("q1", "q3"))
-    config = FitConfig(steps=1, batch_size=4, rollout=3, valve=valve)
+    config = FitConfig(steps=1, batch_size=4, rollout=3, valve=valve, members=1)
     net = fit(log, config, 0, BROKK_170, "brokk170")
     net.weights[5][:] = 1.0  # upwards, by what the nets read
     zones = np.full((2, 2), 0.07, np.float32)

@@ -7,6 +7,7 @@ import pytest
 from helpers_machines import random_net, small_net
 
 from brokk_min._files import save_arrays
+from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.identification.net_file import (
     fingerprint,
@@ -24,7 +25,13 @@ def valve_net():
     return ValveNet(**vars(random_net(rows=4)), dead_zones=zones)
 
 
-@pytest.mark.parametrize("net", [random_net(), valve_net()])
+def ensemble():
+    net = valve_net()
+    weights = tuple(np.stack([w, 2 * w], axis=1) for w in net.weights)
+    return NetEnsemble(**(vars(net) | {"weights": weights}))
+
+
+@pytest.mark.parametrize("net", [random_net(), valve_net(), ensemble()])
 def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
     history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
     save_net(tmp_path / "net.npz", net)
@@ -64,7 +71,13 @@ def test_fingerprint__differs_between_nets_and_survives_a_file(tmp_path):
     assert len({fingerprint(other) for other in (net, *others)}) == 4
 
 
-@pytest.mark.parametrize("net", [random_net(), valve_net()])
+def ensemble():
+    net = valve_net()
+    weights = tuple(np.stack([w, 2 * w], axis=1) for w in net.weights)
+    return NetEnsemble(**(vars(net) | {"weights": weights}))
+
+
+@pytest.mark.parametrize("net", [random_net(), valve_net(), ensemble()])
 @pytest.mark.parametrize("joints", [["j2", "j0"], ["j1"], ["j0", "j1", "j2"]])
 def test_joint_nets__predict_as_they_do_among_others(net, joints):
     index = [net.joints.index(name) for name in joints]

@@ -25,7 +25,6 @@ from helpers_machines import obedient_net, pids
 from brokk_min._files import SHIPPED
 from brokk_min.can.canopen import valve_frame
 from brokk_min.can.operator_input import Script
-from brokk_min.can.safety_gate import fault_name
 from brokk_min.env import reward
 from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.rollout import rollout
@@ -99,6 +98,7 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
     world.downward = recording(out)
     world.run(1.0)
     assert world.drive.gate.active_fault == 0
+    assert {data for can_id, data in out if can_id == 0x080} == {b""}
     assert not [frame for frame in out if frame[0] == 0x210]
     world.operator.enable, world.operator.v = True, (0.0, 0.0, 0.0)
     world.drive.tick()
@@ -279,7 +279,7 @@ def test_run__ends_neutral_on_an_error_of_the_program_itself(world):
         world.drive.run(raises(BrokenPipeError("nobody reads")))
     neutral = valve_frame([0] * 5, int(world.drive.gate.counter), 0).tobytes()
     assert out[-1] == (0x210, neutral)
-    assert fault_name(BROKK_170, int(world.drive.gate.latched_fault)) == "error"
+    assert world.drive.reason == "fault: error (the loop ended)"
     world.downward = unchanged
     world.sleep(0.01)
     assert not world.commands[1][-1].any()

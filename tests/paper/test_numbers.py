@@ -20,7 +20,7 @@ def test_constants__are_the_papers() -> None:
     assert machine.history == 13
     assert (machine.history - 1) * machine.dt == pytest.approx(0.6)
     assert fitting.FitConfig().hidden == 32
-    assert fitting.PAPER_RECIPE["rollout"] == 1
+    assert fitting.PAPER_RECIPE["rollout"] == fitting.PAPER_RECIPE["members"] == 1
     assert TaskConfig().noise == 0.05
     assert PPOConfig().num_envs == 256
     assert Budget().hours == 1.0
