@@ -11,10 +11,10 @@ three seeds along x, y and z, `benchmarks.ladder`):
 
 | Parts | Velocity error | Drift | Valve travel |
 |---|---|---|---|
-| the paper's interface | 0.0357 m/s | 0.196 m | 21 |
-| the observation, too | 0.0181 m/s | 0.054 m | 29 |
-| actions beyond the dead zone, closed valves, too | 0.0157 m/s | 0.045 m | 80 |
-| costs, too | 0.0146 m/s | 0.026 m | 20 |
+| the paper's interface | 0.0332 m/s | 0.183 m | 28 |
+| the observation, too | 0.0174 m/s | 0.050 m | 56 |
+| actions beyond the dead zone, closed valves, too | 0.0147 m/s | 0.032 m | 93 |
+| costs, too | 0.0144 m/s | 0.023 m | 23 |
 
 Who was first: resolved rates (Whitney, 1969) as inputs are residual or "structured" observations of
 many papers; the integral is that of a PI controller; costs of action changes are legged_gym's.
