@@ -18,7 +18,7 @@ Glossary:
     H             number of samples of the history, 13: now and the last 0.6 s
     driven        said of a joint that the controller moves; the operator sets the locked ones
     plant         what moves a machine: the analytic plant, the nets, or another simulator
-    actuator net  one small net per joint: history in, velocity out
+    actuator net  small nets of each joint: history in, velocity out
     counts        127 counts are a full command; an encoder has `encoder_step` rad a count
     activation    state of a valve, 0 to 1: it falls while the valve is idle, and a valve answers
                   late until it has risen again

@@ -35,13 +35,12 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
 
     The same `seed` gives the same bits on one computer. `machine` has the history, the window of
     the estimator that made the velocities of `log`, and the dead zones. `name` is its name in the
-    file; it is empty for a log with other joints, whose nets read the commands as they are.
-    ValueError: a joint that never moves long enough, weights that are not finite at the end, or
-    several members of nets that read the commands as they are.
+    file; it is empty for a log with other joints, which gets one net for each joint that reads the
+    commands as they are.
+    ValueError: a joint that never moves long enough, or weights that are not finite at the end.
     """
-    if not name:
+    if not (name and config.valve):
         config = replace(config, valve=False, members=1)
-    require(config.valve or config.members == 1, "members", "1 of nets as printed", config.members)
     index = [machine.names.index(joint) for joint in log.joints] if name else []
     data = training_set(log, config, machine, machine.dead_zones[index].astype(np.float32))
     seeds = range(seed * config.members, (seed + 1) * config.members)

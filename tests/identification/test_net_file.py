@@ -71,12 +71,6 @@ def test_fingerprint__differs_between_nets_and_survives_a_file(tmp_path):
     assert len({fingerprint(other) for other in (net, *others)}) == 4
 
 
-def ensemble():
-    net = valve_net()
-    weights = tuple(np.stack([w, 2 * w], axis=1) for w in net.weights)
-    return NetEnsemble(**(vars(net) | {"weights": weights}))
-
-
 @pytest.mark.parametrize("net", [random_net(), valve_net(), ensemble()])
 @pytest.mark.parametrize("joints", [["j2", "j0"], ["j1"], ["j0", "j1", "j2"]])
 def test_joint_nets__predict_as_they_do_among_others(net, joints):
