@@ -118,6 +118,7 @@ class Fit(ReadsLogs):
     def defaults(cls, arguments: list[str]) -> Any:
         """Ours, or the settings of the paper's recipe."""
         recipe, required = PAPER_RECIPE if "--paper" in arguments else {}, tyro.MISSING
+        recipe = recipe | ({"members": 1} if "--no-valve" in arguments else {})
         return cls(logs=required, out=required, settings=FitConfig(**recipe))
 
     def __call__(self) -> None:
@@ -125,6 +126,8 @@ class Fit(ReadsLogs):
 
         machine = self.find_machine()
         check_settings(self.settings)
+        valve, members = self.settings.valve, self.settings.members
+        check(valve or members == 1, "--members", "1 of nets that read the commands", members)
         check(self.seed >= 0, "--seed", "0 or more", self.seed)
         check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
         self.writes(self.out, self.json)

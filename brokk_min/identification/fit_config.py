@@ -15,7 +15,7 @@ class FitConfig:
     hidden: int = 32  # units in each of the two hidden layers (paper: 32)
     rollout: int = 8  # ticks of the errors in the last third of the steps (paper: 1)
     valve: bool = True  # do the nets read what a command opens (beyond.valve_nets)? (paper: no)
-    members: int = 5  # such nets a joint, whose mean counts (beyond.net_ensemble) (paper: 1)
+    members: int = 5  # such nets a joint, 1 of others; their mean counts (beyond.net_ensemble)
     newest_only: bool = False  # do they read commands and the newest angle and velocity alone?
 
 

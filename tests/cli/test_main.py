@@ -93,6 +93,8 @@ VIRTUAL = "drive --interface virtual --channel v"
         ("inspect", 2, "LOGS: expected one file or more, got none"),
         ("inspect drive.log --map q1=boom:deg", 1, "--map: expected a table or a recording"),
         ("fit missing.csv --out n.npz", 1, "missing.csv: no such file or directory"),
+        ("fit l.csv --out n.npz --no-valve --members 3", 2, "--members: expected 1 of nets"),
+        ("fit l.csv --out n.npz --paper --members 3", 2, "--members: expected 1 of nets"),
         ("fit l.csv --out n.npz --batch-size 0", 2, "--batch-size: expected a positive number"),
         (TRAIN, 1, "missing.npz: no such file or directory"),
         (f"{TRAIN} --total-steps 0", 2, "--total-steps: expected a positive number, got 0"),

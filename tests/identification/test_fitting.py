@@ -98,7 +98,7 @@ def test_fit__uses_one_step_errors_where_recordings_are_too_short_for_more():
 
 def test_fit__has_nets_that_read_the_newest_outputs_and_all_commands():
     """No older angle or velocity changes what they predict after the fit."""
-    config = FitConfig(10, batch_size=16, newest_only=True, valve=False, members=1)
+    config = FitConfig(10, batch_size=16, newest_only=True, valve=False)
     net = fit(simple_system(0, 3, 60), config, 0, BROKK_170)
     history = np.random.default_rng(0).uniform(-1, 1, (200, 2, 3, 13)).astype(np.float32)
     before = net.predict(history)
