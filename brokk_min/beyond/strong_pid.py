@@ -5,8 +5,8 @@ command that the nets say would hold the wanted velocity (feed-forward), feeds b
 the tool's velocity error, opens a valve wider that has just been closed, and closes all valves
 while the tool rests. So it has the main inputs and tricks of our agent.
 
-What it buys: with gains by the same optimiser its mean velocity error along x, y and z is 0.0114
-m/s, where the paper's structure has 0.0194 m/s (`table.json` of `brokk-min reproduce`).
+What it buys: with gains by the same optimiser its mean velocity error along x, y and z is 0.0113
+m/s, where the paper's structure has 0.0195 m/s (`table.json` of `brokk-min reproduce`).
 
 Who was first: feed-forward by an inverted static map is Merritt's (Hydraulic Control Systems,
 1967); kicks against stiction are Hagglund's (2002).

@@ -1,7 +1,7 @@
 """Velocity sequences and start poses: of the evaluation, of the user's files, and for tuning.
 
-Tuning never opens what is scored: only `task_sequences` has the seed of the scored rests, only
-`evaluation_starts` opens the file of scored starts, and `tuning_set` draws other starts and goals.
+Tuning never sees what is scored: only `task_sequences` has the seed of the scored rests, and
+`tuning_set` draws starts and goals by other seeds than `draw_starts`.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,17 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, brief, numbers, read_csv
+from brokk_min.actuator import lever_arm
 from brokk_min.jacobian import dls, limit_weights
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_goal, draw_hold, draw_pose
-from brokk_min.machine import Array, Machine, require
+from brokk_min.machine import PWM_MAX, Array, Machine, require, valve_opening
 from brokk_min.settings import TaskConfig
 
 AXES = "xyz"
 REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
-DRAWS, POSES = 30, 400  # so often so many poses are drawn, to find feasible ones (assumed)
+DRAWS, POSES = 100, 400  # so often so many poses are drawn, to find feasible ones (assumed)
+UP_DOWN = np.array([[1.0], [-1.0]])
 MARGINS = (  # of `feasible`, all assumed
     "the tool within 20 mm of its path, the arm 0.1 m above the ground, driven joints 0.05 from "
     "their ends and below 0.9 of their speeds"
@@ -155,14 +157,21 @@ def evaluation_starts(
 ) -> Array:
     """Start poses [rad] (num, n): the first of the file that the package has for the machine.
 
-    Without a file they are random poses from which ideal actuators follow all sequences.
-    ValueError: more starts than the file has, or too few that can follow.
+    Without a file they are drawn. ValueError: more starts than the file has.
     """
     path = SHIPPED / machine.name / "starts.csv"
-    if path.exists():
-        starts = read_starts(path, machine)
-        require(num <= len(starts), path.name, f"at most {len(starts)} starts", num)
-        return starts[:num]
+    if not path.exists():
+        return draw_starts(machine, num, sequences, seed)
+    starts = read_starts(path, machine)
+    require(num <= len(starts), path.name, f"at most {len(starts)} starts", num)
+    return starts[:num]
+
+
+def draw_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed: int) -> Array:
+    """Random poses [rad] (num, n) from which ideal actuators follow all sequences.
+
+    The first ones are the same for any `num`. ValueError: too few.
+    """
     rng = np.random.default_rng(seed)
 
     def draw() -> tuple[Array]:
@@ -177,14 +186,16 @@ def evaluation_starts(
 def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     """Can ideal actuators follow `goals` [m/s] (T, num, 3) from `start` [rad] (num, n)? (num,).
 
-    Integrates resolved velocities with little damping, and asks for `MARGINS` at each tick.
-    The tool stays on its path where no singularity is crossed.
+    They answer at once, and are as fast as the machine's at the command limit. Integrates resolved
+    velocities with little damping, and asks for `MARGINS` at each tick. The tool stays on its path
+    where no singularity is crossed.
     """
     q, q_dot = np.array(start, float), np.zeros((len(start), machine.n))
     p_goal = tool_position(forward_kinematics(machine, q))
     result = np.ones(len(q), bool)
     low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
-    up, down = machine.column("q_dot_up"), machine.column("q_dot_down")
+    opening = valve_opening(machine.pwm_limit / PWM_MAX * UP_DOWN, machine.dead_zones)
+    up, down = 0.9 * opening * machine.cylinder_speeds.T  # of the cylinders [m/s], (n,) each
     for v_goal in goals:
         frames = forward_kinematics(machine, q)
         off = p_goal - tool_position(frames)
@@ -195,9 +206,10 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
         v = v_goal + off  # the second term brings the tool back to its path in 1 s
         q_dot = np.zeros_like(q)
         q_dot[:, machine.driven] = (J_inv @ v[..., None])[..., 0]
+        speed = q_dot * lever_arm(machine, q)  # dq/dt = v / r(q)
         q, p_goal = q + q_dot * machine.dt, p_goal + v_goal * machine.dt
-        result &= ((q > low) & (q < high))[:, machine.driven].all(axis=-1)
-        result &= ((q_dot > -0.9 * down) & (q_dot < 0.9 * up)).all(axis=-1)
+        fits = (q > low) & (q < high) & (speed > down) & (speed < up)
+        result &= fits[:, machine.driven].all(axis=-1)
     return result
 
 

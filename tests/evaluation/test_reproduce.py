@@ -12,7 +12,7 @@ from helpers_machines import one_by_one
 from brokk_min.evaluation import baselines, report, reproduce
 from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget, variations
-from brokk_min.evaluation.sequences import task_sequences
+from brokk_min.evaluation.sequences import read_starts, task_sequences
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import fingerprint, load_net
 from brokk_min.learning.policy import POLICIES, load_policy
@@ -77,6 +77,7 @@ def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
     ours, printed = (load_net(folder / f"{name}.npz", COARSE) for name in ("net", "net_paper"))
     assert learned_on["rl"] == learned_on["rl_paper"] == fingerprint(ours)
     assert learned_on["rl_critic"] == fingerprint(printed) != fingerprint(ours)
+    np.testing.assert_array_equal(read_starts(folder / "starts.csv", COARSE), results["starts"])
     pids = baselines.read_gains(folder / "gains.json", COARSE, policies["rl"].net)
     assert list(pids) == PIDS
     assert results["meta"]["seed"] == 3 and results["meta"]["machine"] == "brokk170"
@@ -93,7 +94,7 @@ def test_reproduce__results_hold_every_run_with_its_figures(results):
     scored = [run for run in runs if run["controller"] == "rl"]
     mean = results["task_space"]["means"]["rl"]["all"][ERROR]["mean"]
     assert mean == pytest.approx(np.mean([run[ERROR] for run in scored]))
-    assert set(results["robustness"]) == set(variations(BROKK_170))
+    assert set(results["robustness"]) == {*variations(BROKK_170), "goals +50 %"}
     along = [run[ERROR] for run in scored if run["sequence"] in "xyz"]
     assert results["table"]["rl"][ERROR]["mean"] == pytest.approx(np.mean(along))
 

@@ -1,6 +1,7 @@
 """Robustness: machines that differ in one thing each, and the table over them."""
 
 import numpy as np
+import pytest
 from helpers_machines import Idle, obedient_net, pids
 
 from brokk_min.evaluation.metrics import by_start, evaluate, mean_interval
@@ -35,7 +36,7 @@ def test_robustness__has_a_row_for_each_variation_and_controller():
     short = [ALONG_Z._replace(goals=ALONG_Z.goals[MOVES - 2 : MOVES + 18])]
     controllers = {"idle": Idle(), "pid": PIDS["jacobian_pid_ff_integral"]}
     table = robustness(BROKK_170, controllers, short, STARTS, 0)
-    assert list(table) == list(variations(BROKK_170))
+    assert list(table) == [*variations(BROKK_170), "goals +50 %"]
     machine = variations(BROKK_170)["delay +50 ms"]
     runs, _ = evaluate(machine, controllers, short, STARTS, 0)
     error = by_start(runs, "pid", "all", "velocity_error_mean")
@@ -43,3 +44,5 @@ def test_robustness__has_a_row_for_each_variation_and_controller():
     errors = {name: row["pid"]["mean"] for name, row in table.items()}
     assert errors["nominal"] < min(errors["delay +50 ms"], errors["dead zone 10 %"])
     assert table["delay +50 ms"]["idle"] == table["nominal"]["idle"]
+    faster = 1.5 * table["nominal"]["idle"]["mean"]
+    assert table["goals +50 %"]["idle"]["mean"] == pytest.approx(faster)

@@ -6,8 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from brokk_min.actuator import lever_arm
 from brokk_min.evaluation import sequences as s
-from brokk_min.kinematics import forward_kinematics, lowest_point, tool_position
+from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point
 from brokk_min.machine import BROKK_170
 
 START = np.array(BROKK_170.q_start)
@@ -127,10 +128,11 @@ def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row)
 # --- start poses ----------------------------------------------------------------------------------
 
 
-def test_evaluation_starts__of_the_package_can_follow_all_sequences():
+def test_evaluation_starts__of_the_package_are_those_of_reproduce():
     starts = s.evaluation_starts(BROKK_170, 32, [], 0)
     assert len(np.unique(starts, axis=0)) == 32
-    assert np.histogram(starts[:, 0], [-2.14, -0.7, 0.7, 2.14])[0].min() >= 5
+    drawn = s.draw_starts(BROKK_170, 1, s.task_sequences(BROKK_170), 2)
+    np.testing.assert_array_equal(drawn, starts[:1])
     for sequence in s.task_sequences(BROKK_170):
         goals = sequence.for_starts(BROKK_170, starts)
         assert s.feasible(BROKK_170, starts, goals).all(), sequence.name
@@ -138,20 +140,22 @@ def test_evaluation_starts__of_the_package_can_follow_all_sequences():
         s.evaluation_starts(BROKK_170, 33, [], 0)
 
 
-def test_evaluation_starts__of_another_machine_are_drawn():
+def test_draw_starts__are_random_poses_from_which_ideal_actuators_follow():
     other = replace(BROKK_170, name="other")
     short = [s.Commands("z", s.axis_sequences(other)[2].goals[15:40])]
     starts = s.evaluation_starts(other, 5, short, 3)
-    assert starts.shape == (5, 5)
+    assert len(np.unique(starts, axis=0)) == 5
     assert s.feasible(other, starts, short[0].for_starts(other, starts)).all()
+    np.testing.assert_array_equal(s.draw_starts(BROKK_170, 3, short, 3), starts[:3])
+    assert (s.draw_starts(BROKK_170, 5, short, 4) != starts).any()
 
 
-def test_evaluation_starts__refuse_a_machine_that_can_follow_nothing(monkeypatch):
+def test_draw_starts__refuses_a_machine_that_can_follow_nothing(monkeypatch):
     monkeypatch.setattr(s, "draw_pose", lambda *_: np.tile(START, (3, 1)))  # faster
     sequences = [s.Commands("fast", np.full((2, 3), 9.0))]
-    message = "^other: expected 2 starts with the tool within 20 mm of its path, .*, got 0$"
+    message = "^brokk170: expected 2 starts with the tool within 20 mm of its path, .*, got 0$"
     with pytest.raises(ValueError, match=message):
-        s.evaluation_starts(replace(BROKK_170, name="other"), 2, sequences, 0)
+        s.draw_starts(BROKK_170, 2, sequences, 0)
 
 
 # --- feasible paths -------------------------------------------------------------------------------
@@ -184,14 +188,18 @@ def test_feasible__keeps_a_margin_to_joint_limits(joint, end):
 
 
 @pytest.mark.parametrize("direction", [-1, 1])
-def test_feasible__keeps_a_margin_to_the_speed_limits(direction):
+@pytest.mark.parametrize("joint", [0, 2])
+def test_feasible__keeps_a_margin_to_what_a_cylinder_can_do_there(joint, direction):
+    """One joint alone; the arm of q1's drive is constant, that of q3 is not."""
     start = np.array([0.0, *START[1:]])
-    limit = -0.20 if direction < 0 else 0.20  # of q1 [rad/s]
-    radius = np.hypot(*tool_position(forward_kinematics(BROKK_170, start))[:2])
-    machine = replace(BROKK_170, rate=100.0)
-    for fraction, expected in ((0.89, True), (0.91, False)):
-        slewing = np.tile([0.0, fraction * limit * radius, 0.0], (2, 1, 1))
-        assert follows(start, slewing, machine) == expected
+    alone = (replace(one, driven=i == joint) for i, one in enumerate(BROKK_170.joints))
+    machine = replace(BROKK_170, rate=100.0, joints=tuple(alone))
+    cylinder = {-1: {0: 0.0498, 2: 0.0825}, 1: {0: 0.0498, 2: 0.0453}}[direction][joint]
+    fastest = direction * 0.602 * cylinder / lever_arm(machine, start)[joint]  # 63 % opens 0.602
+    column = jacobian(forward_kinematics(machine, start))[:, joint]
+    for fraction, expected in ((0.88, True), (0.92, False)):
+        goals = np.tile(fraction * fastest * column, (2, 1, 1))
+        assert follows(start, goals, machine) == expected
 
 
 @pytest.mark.parametrize("rate", [5.0, 10.0, 20.0])
