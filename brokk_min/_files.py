@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from brokk_min.machine import require
 
-# a folder for each machine: policies, gains and table of `make reproduce`
+# a folder for each machine: policies, gains, starts and table of `make reproduce`
 SHIPPED = Path(__file__).parent / "shipped"
 
 

@@ -11,10 +11,10 @@ three seeds along x, y and z, `benchmarks.ladder`):
 
 | Parts | Velocity error | Drift | Valve travel |
 |---|---|---|---|
-| the paper's interface | 0.0332 m/s | 0.183 m | 28 |
-| the observation, too | 0.0174 m/s | 0.050 m | 56 |
-| actions beyond the dead zone, closed valves, too | 0.0147 m/s | 0.032 m | 93 |
-| costs, too | 0.0144 m/s | 0.023 m | 23 |
+| the paper's interface | 0.0327 m/s | 0.185 m | 28 |
+| the observation, too | 0.0171 m/s | 0.047 m | 56 |
+| actions beyond the dead zone, closed valves, too | 0.0145 m/s | 0.030 m | 91 |
+| costs, too | 0.0143 m/s | 0.022 m | 23 |
 
 Who was first: resolved rates (Whitney, 1969) as inputs are residual or "structured" observations of
 many papers; the integral is that of a PI controller; costs of action changes are legged_gym's.

@@ -176,6 +176,7 @@ def draw_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed:
 
     def draw() -> tuple[Array]:
         poses = draw_pose(machine, rng, POSES).round(4)
+        poses = np.clip(poses, machine.column("q_min"), machine.column("q_max"))
         for sequence in sequences:
             poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
         return (poses,)
@@ -186,9 +187,9 @@ def draw_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed:
 def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     """Can ideal actuators follow `goals` [m/s] (T, num, 3) from `start` [rad] (num, n)? (num,).
 
-    They answer at once, and are as fast as the machine's at the command limit. Integrates resolved
-    velocities with little damping, and asks for `MARGINS` at each tick. The tool stays on its path
-    where no singularity is crossed.
+    They answer at once, and are as fast as the analytic plant's cylinders at the command limit.
+    Integrates resolved velocities with little damping, and asks for `MARGINS` at each tick. The
+    tool stays on its path where no singularity is crossed.
     """
     q, q_dot = np.array(start, float), np.zeros((len(start), machine.n))
     p_goal = tool_position(forward_kinematics(machine, q))

@@ -59,7 +59,15 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
     )
     out = tmp_path / "results"
     assert run(f"reproduce --quick --machine '{tmp_path}/m.py:COARSE' --seed 3 --out", out) == 0
-    for name in ("log.npz", "net.npz", "policy.npz", "gains.json", "results.json", "table.json"):
+    for name in (
+        "log.npz",
+        "net.npz",
+        "policy.npz",
+        "gains.json",
+        "starts.csv",
+        "results.json",
+        "table.json",
+    ):
         assert (folder / name).read_bytes() == (out / name).read_bytes(), name
     assert capsys.readouterr().out.endswith(f"{out / 'results.json'}\n")
 

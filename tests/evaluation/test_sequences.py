@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from brokk_min.actuator import lever_arm
 from brokk_min.evaluation import sequences as s
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point
 from brokk_min.machine import BROKK_170
@@ -131,8 +130,8 @@ def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row)
 def test_evaluation_starts__of_the_package_are_those_of_reproduce():
     starts = s.evaluation_starts(BROKK_170, 32, [], 0)
     assert len(np.unique(starts, axis=0)) == 32
-    drawn = s.draw_starts(BROKK_170, 1, s.task_sequences(BROKK_170), 2)
-    np.testing.assert_array_equal(drawn, starts[:1])
+    drawn = s.draw_starts(BROKK_170, 2, s.task_sequences(BROKK_170), 2)
+    np.testing.assert_array_equal(drawn, starts[:2])
     for sequence in s.task_sequences(BROKK_170):
         goals = sequence.for_starts(BROKK_170, starts)
         assert s.feasible(BROKK_170, starts, goals).all(), sequence.name
@@ -190,12 +189,13 @@ def test_feasible__keeps_a_margin_to_joint_limits(joint, end):
 @pytest.mark.parametrize("direction", [-1, 1])
 @pytest.mark.parametrize("joint", [0, 2])
 def test_feasible__keeps_a_margin_to_what_a_cylinder_can_do_there(joint, direction):
-    """One joint alone; the arm of q1's drive is constant, that of q3 is not."""
-    start = np.array([0.0, *START[1:]])
+    """One joint alone. At 1.4 rad the arm of q3 is 0.198 m, not its longest, 0.3 m."""
+    start = np.array([0.0, 0.5, 1.4, 1.71, 1.24])
     alone = (replace(one, driven=i == joint) for i, one in enumerate(BROKK_170.joints))
     machine = replace(BROKK_170, rate=100.0, joints=tuple(alone))
     cylinder = {-1: {0: 0.0498, 2: 0.0825}, 1: {0: 0.0498, 2: 0.0453}}[direction][joint]
-    fastest = direction * 0.602 * cylinder / lever_arm(machine, start)[joint]  # 63 % opens 0.602
+    arm = {0: 0.15, 2: 0.198}[joint]  # q3: a triangle of 0.9 m, 0.3 m and 2.2 rad
+    fastest = direction * 0.602 * cylinder / arm  # 63 % opens 0.602
     column = jacobian(forward_kinematics(machine, start))[:, joint]
     for fraction, expected in ((0.88, True), (0.92, False)):
         goals = np.tile(fraction * fastest * column, (2, 1, 1))
