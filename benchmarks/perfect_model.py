@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from brokk_min.actuator import PLANT, PlantState, lever_arm
 from brokk_min.beyond.interface import REST_AFTER
 from brokk_min.evaluation.metrics import evaluate, means
-from brokk_min.evaluation.sequences import axis_sequences, evaluation_starts, task_sequences
+from brokk_min.evaluation.sequences import axis_sequences, evaluation_starts
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
 from brokk_min.machine import (
@@ -167,8 +167,7 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
 def main() -> None:
     """Print the error of the bound along x, y and z, from the first starts, by default 16."""
     machine = BROKK_170
-    num = int(sys.argv[1]) if len(sys.argv) > 1 else 16
-    starts = evaluation_starts(machine, num, task_sequences(machine), 2)
+    starts = evaluation_starts(machine, int(sys.argv[1]) if len(sys.argv) > 1 else 16, [], 0)
     bound = {"perfect model": PerfectModel(machine, starts)}
     runs, _ = evaluate(machine, bound, axis_sequences(machine), starts, 0)
     for sequence, row in means(runs)["perfect model"].items():

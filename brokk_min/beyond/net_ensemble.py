@@ -6,8 +6,8 @@ errs by chance the others do not, and a policy cannot learn to use the error of 
 
 What it buys: after three million steps on five nets (`train --total-steps 3000000`) our agent has
 an error of 0.0120 m/s along x, y and z and a drift of 0.015 m, on one (`fit --members 1`) 0.0124
-m/s and 0.019 m (means of two seeds). The fit takes five times as long, and with valves 20 % slower
-or faster than in the log the agent, fully trained, errs 1 to 3 % more.
+m/s and 0.019 m (means of two seeds). The fit takes five times as long. With valves 20 % slower or
+faster than in the log the agent, fully trained, errs no less.
 
 Who was first: Hansen and Salamon (1990) for classifiers, Breiman's bagging (1996);
 Lakshminarayanan et al. (2017) for seeds alone. ME-TRPO (Kurutach et al., 2018) trains policies on

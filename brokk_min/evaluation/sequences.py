@@ -24,8 +24,7 @@ AXES = "xyz"
 REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
-DRAWS, POSES = 100, 400  # so often so many poses are drawn, to find feasible ones (assumed)
-UP_DOWN = np.array([[1.0], [-1.0]])
+DRAWS, POSES = 50, 400  # so often so many poses are drawn, to find feasible ones (assumed)
 MARGINS = (  # of `feasible`, all assumed
     "the tool within 20 mm of its path, the arm 0.1 m above the ground, driven joints 0.05 from "
     "their ends and below 0.9 of their speeds"
@@ -195,7 +194,8 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     p_goal = tool_position(forward_kinematics(machine, q))
     result = np.ones(len(q), bool)
     low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
-    opening = valve_opening(machine.pwm_limit / PWM_MAX * UP_DOWN, machine.dead_zones)
+    limit = machine.pwm_limit / PWM_MAX * np.array([[1.0], [-1.0]])
+    opening = valve_opening(limit, machine.dead_zones)  # up, and down, which is negative
     up, down = 0.9 * opening * machine.cylinder_speeds.T  # of the cylinders [m/s], (n,) each
     for v_goal in goals:
         frames = forward_kinematics(machine, q)

@@ -130,6 +130,7 @@ def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row)
 def test_evaluation_starts__of_the_package_are_those_of_reproduce():
     starts = s.evaluation_starts(BROKK_170, 32, [], 0)
     assert len(np.unique(starts, axis=0)) == 32
+    assert np.histogram(starts[:, 0], [-2.14, -0.7, 0.7, 2.14])[0].min() >= 5
     drawn = s.draw_starts(BROKK_170, 2, s.task_sequences(BROKK_170), 2)
     np.testing.assert_array_equal(drawn, starts[:2])
     for sequence in s.task_sequences(BROKK_170):
@@ -197,7 +198,7 @@ def test_feasible__keeps_a_margin_to_what_a_cylinder_can_do_there(joint, directi
     arm = {0: 0.15, 2: 0.198}[joint]  # q3: a triangle of 0.9 m, 0.3 m and 2.2 rad
     fastest = direction * 0.602 * cylinder / arm  # 63 % opens 0.602
     column = jacobian(forward_kinematics(machine, start))[:, joint]
-    for fraction, expected in ((0.88, True), (0.92, False)):
+    for fraction, expected in ((0.89, True), (0.91, False)):
         goals = np.tile(fraction * fastest * column, (2, 1, 1))
         assert follows(start, goals, machine) == expected
 
