@@ -3,7 +3,8 @@
 What it changes: `jacobian.JacobianController` is the paper's. This one adds to each valve the
 command that the nets say would hold the wanted velocity (feed-forward), feeds back the integral of
 the tool's velocity error, opens a valve wider that has just been closed, and closes all valves
-while the tool rests. So it has the main inputs and tricks of our agent.
+while the tool rests. So it has the main inputs and tricks of our agent, but for the time of the
+Jacobian in the integral, which does not help it (D13 in docs/deviations.md).
 
 What it buys: with gains by the same optimiser its mean velocity error along x, y and z is 0.0113
 m/s, where the paper's structure has 0.0195 m/s (`table.json` of `brokk-min reproduce`).
@@ -18,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from brokk_min.actuator import ActuatorNet
-from brokk_min.beyond.interface import Memory, remember, resting, smooth_angles
+from brokk_min.beyond.interface import Memory, accumulate, resting, smooth_angles
 from brokk_min.jacobian import Gains, JacobianController, PIDState
 from brokk_min.machine import PWM_MAX, Array, Machine, Measured, valve_opening
 
@@ -108,7 +109,7 @@ class StrongPID(JacobianController):
     ) -> tuple[Array, StrongState]:
         """Commands u [-1, 1] (..., n), and the state of the next tick."""
         m, gains, before = self.machine, self.gains, state.pid
-        memory = remember(m, state.memory, measured)
+        memory = accumulate(m, state.memory, measured)
         q = measured.q.astype(float)
         q[..., m.driven] = smooth_angles(m, measured.history)
         v = measured.v_goal + gains.feedback * (measured.v_goal - measured.v_tool)

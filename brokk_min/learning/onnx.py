@@ -14,7 +14,8 @@ OBSERVATION = (
     "tool [m/s], angles of locked joints [rad or m]; interface paper: histories of angles and of "
     "velocities of each driven joint, then of its command for each driven joint [of full command]; "
     "interface beyond: smoothed angles of driven joints, newer halves of the histories of their "
-    "velocities, then commands, then open indicators, resolved velocities of goal and integral"
+    "velocities, then commands, then open indicators, resolved velocities of goal and integral, "
+    "see brokk_min/beyond/interface.py"
 )
 
 

@@ -11,21 +11,31 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers_machines import DRIVEN, numbered_history
+from helpers_machines import DRIVEN, numbered_history, steady
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import machines
+from strategies import machines, posed
 
 from brokk_min import env
 from brokk_min.beyond import interface
-from brokk_min.beyond.interface import Memory, command, observation_scale, observe, smooth_angles
+from brokk_min.beyond.interface import (
+    Memory,
+    accumulate,
+    command,
+    observation_scale,
+    observe,
+    remember,
+    smooth_angles,
+)
 from brokk_min.env import measure
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170
 
+V_TOOL = (0.05, -0.02, 0.09)  # m/s
+
 
 def memory(rest_ticks: int | list[int] = 0, integral: tuple[float, ...] = (0.0,) * 3) -> Memory:
-    return Memory(np.zeros(3), np.array(integral), np.array(rest_ticks))
+    return Memory(np.zeros(3), np.array(V_TOOL), np.array(integral), np.array(rest_ticks))
 
 
 def test_smooth_angles__by_hand():
@@ -53,6 +63,26 @@ def test_smooth_angles__are_the_angles_of_steady_motion_and_of_constant_accelera
     np.testing.assert_allclose(smooth_angles(machine, history), angles[:, -1], atol=1e-9)
 
 
+@given(posed(shapes=[(5,)]), st.integers(0, 1000))
+def test_remember__has_the_velocity_that_the_tool_had_when_the_joints_had_theirs(case, seed):
+    """Of joints in steady motion, by differences of the pose; noise of its own stays as it is."""
+    machine, q = case
+    q_dot, noise = np.random.default_rng(seed).normal(0, 0.3, (2, 8))
+    q_dot = np.where(np.isin(np.arange(machine.n), machine.driven), q_dot[: machine.n], 0)
+    now = steady(q, np.zeros(3), q_dot, machine=machine)
+    now = now._replace(v_tool=now.v_tool + noise[:3])
+    past = now.q - machine.dt * (machine.velocity_samples - 1) / 2 * q_dot
+    tools = [forward_kinematics(machine, past + s * 1e-6 * q_dot).p[:, -1] for s in (1, -1)]
+    expected = (tools[0] - tools[1]) / 2e-6 + noise[:3]
+    first = remember(machine, None, now)
+    np.testing.assert_allclose(first.v_tool, expected, atol=1e-6)
+    first = first._replace(v_goal=expected + 1e-3)  # a small error, which no cut hides
+    found, same = remember(machine, first, now), now._replace(v_tool=expected)
+    np.testing.assert_allclose(found.v_tool, expected, atol=1e-6)
+    integral = accumulate(machine, first, same).error_integral
+    np.testing.assert_allclose(found.error_integral, integral, atol=1e-6 / machine.rate)
+
+
 def test_observe__by_hand():
     """Smoothed angles, the newer half of the paper's samples by their weights, our own blocks."""
     integral = (0.02, -0.01, 0.03)
@@ -61,6 +91,7 @@ def test_observe__by_hand():
     obs = observe(BROKK_170, measured, memory(0, integral))
     assert obs.shape == (91,) and obs.dtype == np.float32
     paper = env.features(BROKK_170, measured)
+    paper[3:6] = np.array(V_TOOL) / env.observation_scale(BROKK_170)[1][3:6]
     np.testing.assert_allclose(obs[:7], 0.75 * paper[:7], rtol=1e-5)
     q = measured.q.astype(float)
     q[DRIVEN] = smooth_angles(BROKK_170, measured.history)

@@ -71,10 +71,16 @@ def test_integral_feedback__adds_the_error_integral_to_the_goal():
     state = c.start(1)
     for _ in range(4):
         _, state = c(measured(0.1 * GOAL), state._replace(pid=c.start(1).pid))
-    fades = np.exp(-0.025 * np.arange(1, 4)).sum()
+    fades = np.exp(-0.0125 * np.arange(1, 4)).sum()
     lag = 0.006 * GOAL / np.linalg.norm(GOAL)  # |0.1 GOAL| = 7 mm/s
     v = 0.1 * GOAL + 2.0 * 0.05 * fades * lag
     np.testing.assert_allclose(state.pid.q_dot_goal[0], np.linalg.pinv(J) @ v, rtol=1e-5)
+
+
+def test_integral__is_of_the_papers_tool_velocity():
+    now = measured(GOAL, 0.1)
+    _, state = controller()(now, controller().start(1))
+    np.testing.assert_array_equal(state.memory.v_tool, now.v_tool)
 
 
 def test_starts__open_a_closed_valve_wider_for_a_while():

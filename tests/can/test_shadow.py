@@ -1,11 +1,12 @@
 """A drive that only listens, beside a remote control: no frame leaves, and what it tells."""
 
 from dataclasses import replace
+from functools import partial
 
 import can
 import numpy as np
 import pytest
-from helpers_bus import ConstantCommand, HoldingOperator, RemoteControl, World, only
+from helpers_bus import START, ConstantCommand, HoldingOperator, RemoteControl, World, only
 from helpers_cli import run
 
 from brokk_min._files import SHIPPED
@@ -19,26 +20,28 @@ from brokk_min.machine import BROKK_170
 Q4 = 3
 
 
-def to_and_fro(tick):
-    """Somebody moves q4 with the remote control, [counts of 127]."""
-    return np.array([0, 0, 0, 40 * ((tick > 20) - 2 * (tick > 50) + (tick > 90)), 0])
+def to_and_fro(joint, tick):
+    """Somebody moves a joint with the remote control, [counts of 127]."""
+    return 40 * ((tick > 20) - 2 * (tick > 50) + (tick > 90)) * (np.arange(5) == joint)
 
 
-def shadowed(machine=BROKK_170, controller=None, operator=None, log=None, sync=False, period=0.05):
+def shadowed(
+    machine=BROKK_170, controller=None, operator=None, log=None, sync=False, period=0.05, moved=Q4
+):
     """A world with a remote control and a shadow, and the frames that leave the shadow."""
     if controller is None:
         path = SHIPPED / BROKK_170.name / POLICIES["rl"]
         controller = PolicyController(BROKK_170, load_policy(path, BROKK_170))
     world, left = World(controller, operator, log=log), []
-    world.noise = RemoteControl(world, to_and_fro, period)
+    world.noise = RemoteControl(world, partial(to_and_fro, moved), period)
     world.downward = lambda can_id, data: left.append((can_id, data)) or [(can_id, data)]
     world.drive = Shadow(machine, controller, world.bus, operator, sync)
     world.drive.begin()
     return world, left
 
 
-def correlation(drive):
-    would, sent = np.array(drive.pairs)[:, :, Q4].T
+def correlation(drive, joint=Q4):
+    would, sent = np.array(drive.pairs)[:, :, joint].T
     return np.corrcoef(would, sent)[0, 1]
 
 
@@ -66,13 +69,18 @@ def test_shadow__compares_and_logs_what_it_would_send_and_sends_nothing(tmp_path
     )
 
 
-def test_shadow__tells_an_encoder_of_the_wrong_sign():
-    """Its goal is the measured motion, so the policy disagrees with what causes the motion."""
-    q4 = replace(BROKK_170.joints[Q4], encoder_sign=-1, encoder_zero=round(2 * 1.71 * 4096 / 6.283))
-    joints = (*BROKK_170.joints[:Q4], q4, BROKK_170.joints[4])
-    world, left = shadowed(replace(BROKK_170, joints=joints))
+@pytest.mark.parametrize("j", [0, 2, 4])
+def test_shadow__tells_an_encoder_of_the_wrong_sign(j):
+    """Its goal is the measured motion, so the policy disagrees with what causes the motion.
+
+    The reading falls from the start on where it should rise.
+    """
+    zero = round(2 * START[j] * 4096 / 6.283)
+    wrong = replace(BROKK_170.joints[j], encoder_sign=-1, encoder_zero=zero)
+    joints = (*BROKK_170.joints[:j], wrong, *BROKK_170.joints[j + 1 :])
+    world, left = shadowed(replace(BROKK_170, joints=joints), moved=j)
     world.run(6.0)
-    assert left == [] and correlation(world.drive) < -0.3
+    assert left == [] and correlation(world.drive, j) < -0.5
 
 
 def test_report__by_hand():

@@ -71,7 +71,7 @@ def test_step__leaks_nothing_between_rows():
 
 
 def test_step__subtracts_the_costs_of_the_interface_from_eq2():
-    """0.1 of the commands' mean change, of the limit, and the length of the error integral."""
+    """0.1 of the commands' mean change, of the limit, and 1.5 times the error integral's length."""
     env = TaskVectorEnv(5, NET, LOW, TaskConfig(noise=0.0), INTERFACE)
     env.reset(seed=1)
     rng = np.random.default_rng(2)
@@ -84,7 +84,9 @@ def test_step__subtracts_the_costs_of_the_interface_from_eq2():
         error = np.linalg.norm(v_goal - env.state.v_tool, axis=-1)
         np.testing.assert_allclose(info["velocity_error"], error, rtol=1e-6)
         integral = np.linalg.norm(env.memory.error_integral, axis=-1)
-        np.testing.assert_allclose(rewards, 1 / (1 + error) - 0.1 * travel - integral, atol=1e-6)
+        np.testing.assert_allclose(
+            rewards, 1 / (1 + error) - 0.1 * travel - 1.5 * integral, atol=1e-6
+        )
         u_before = u
 
 

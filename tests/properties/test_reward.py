@@ -116,8 +116,8 @@ def measured(machine: Machine, v_goal: np.ndarray, v_tool: np.ndarray) -> Measur
 
 
 @given(heard())
-def test_memory__of_our_agent_is_a_sum_of_cut_errors_that_fade_in_two_seconds(case):
-    """I_t = sum_k exp(-(t - k) dt / 2 s) dt cut(v_goal of k - v_tool of k + 1), one by one.
+def test_memory__of_our_agent_is_a_sum_of_cut_errors_that_fade_in_four_seconds(case):
+    """I_t = sum_k exp(-(t - k) dt / 4 s) dt cut(v_goal of k - v_tool of k + 1), one by one.
 
     The cut leaves 2 % of the tool speed along the goal, and 7 % across it.
     """
@@ -134,7 +134,7 @@ def test_memory__of_our_agent_is_a_sum_of_cut_errors_that_fade_in_two_seconds(ca
                 along = math.copysign(min(abs(along), 0.02 * machine.tool_speed), along)
                 size, limit = math.hypot(*across), 0.07 * machine.tool_speed
                 across = across * limit / size if size > limit else across
-                fade = math.exp(-(t - k) / machine.rate / 2.0) / machine.rate
+                fade = math.exp(-(t - k) / machine.rate / 4.0) / machine.rate
                 expected += fade * (along * d + across)
             np.testing.assert_allclose(memory.error_integral[i], expected, atol=1e-8)
             ticks = 0  # without a goal, up to now
@@ -145,7 +145,7 @@ def test_memory__of_our_agent_is_a_sum_of_cut_errors_that_fade_in_two_seconds(ca
 
 
 @given(heard(), st.integers(0, 1000))
-def test_cost__of_our_agent_is_a_tenth_of_the_valve_travel_and_the_error_integral(case, seed):
+def test_cost__of_our_agent_is_a_part_of_the_valve_travel_and_of_the_error_integral(case, seed):
     machine, goals, v_tool = case
     memory = None
     for goal, v in zip(goals, v_tool, strict=True):
@@ -155,6 +155,6 @@ def test_cost__of_our_agent_is_a_tenth_of_the_valve_travel_and_the_error_integra
     for i in range(2):
         changes = [abs(u[i, j] - before[i, j]) * 127 / machine.pwm_limit for j in machine.driven]
         travel = 0.1 * sum(changes) / len(changes)
-        integral = math.sqrt(sum(float(x) ** 2 for x in memory.error_integral[i]))
+        integral = 1.5 * math.sqrt(sum(float(x) ** 2 for x in memory.error_integral[i]))
         np.testing.assert_allclose(found[i], travel + integral, atol=1e-7)
     assert PAPER.cost(machine, u, before, None) == 0
