@@ -47,6 +47,11 @@ def test_imports__have_no_circle():
     graphlib.TopologicalSorter({name: imports(name) for name in MODULES}).prepare()
 
 
+def test_the_program__sets_its_threads_before_numpy_is_imported():
+    code = "import brokk_min, sys; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+
+
 def test_importing_the_package__changes_no_environment_and_imports_no_torch():
     code = "import os, sys; before = dict(os.environ); import brokk_min, brokk_min.env"
     code += "; print(dict(os.environ) == before, 'torch' in sys.modules)"
