@@ -1,20 +1,18 @@
 """Pictures of a machine: two views, angles and valves of its joints, goal and measured velocity.
 
-Nothing but kinematics is used, so any `Machine` can be drawn. Joints and links are where the
-machine has them; tracks, turret and the widths of links are generic. Everything is drawn twice as
-large and then scaled down, so that edges are smooth: lengths are half pixels, and y points down.
+Nothing but kinematics is used, so any `Machine` can be drawn, as links between its joints.
+Everything is drawn twice as large and then scaled down, so that edges are smooth: lengths are half
+pixels, and y points down.
 """
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib import get_data_path
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
-from scipy.spatial import ConvexHull
 
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import PWM_MAX, Array, Machine
@@ -22,15 +20,14 @@ from brokk_min.machine import PWM_MAX, Array, Machine
 Colour = tuple[int, int, int]
 Pen = ImageDraw.ImageDraw
 BACKGROUND, INK, MUTED = (250, 250, 247), (33, 37, 43), (120, 128, 138)
-GRID, SLOT, SOIL, STEEL = (228, 230, 232), (212, 216, 221), (214, 203, 186), (74, 80, 88)
+GRID, SLOT, SOIL = (228, 230, 232), (212, 216, 221), (214, 203, 186)
 MEASURED = (0, 158, 115)
 BLUE, ORANGE = (0, 114, 178), (213, 94, 0)  # of the machine under the policy, under the PID
 HEAD, ROW = 72, 40  # heights of the title and of a joint's row
 NO_POINTS = np.zeros((0, 3))
 ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up of the top view
-# Outlines of links: how far along the link, and half the width there. The last is the breaker.
-BOOM = np.array([[0, 1.0], [0.3, 1.2], [1, 0.7]])
-BREAKER = np.array([[0, 0.6], [0.1, 1.3], [0.6, 1.3], [0.66, 0.5], [0.93, 0.35], [1, 0.05]])
+# Outline of a link: how far along it, and half its width there.
+LINK = np.array([[0, 1.0], [0.3, 1.2], [1, 0.7]])
 CIRCLE = np.exp(2j * np.pi * np.arange(24)[:, None] / 24).view(float)  # corners (x, y)
 
 
@@ -55,7 +52,6 @@ def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
         part = Image.new("RGB", view.size, BACKGROUND)
         pen = ImageDraw.Draw(part)
         _backdrop(pen, machine, view)
-        _base(pen, machine, view, scene.q)
         _arm(pen, machine, view, scene)
         _tool(pen, machine, view, scene)
         image.paste(part, view.corner)
@@ -135,35 +131,14 @@ def _backdrop(pen: Pen, machine: Machine, view: View) -> None:
     pen.text((16, 20), f"{view.label}, grid of 1 m", MUTED, _font(22), "lm")
 
 
-def _base(pen: Pen, machine: Machine, view: View, q: Array) -> None:
-    """Tracks along x, and over them the turret, which turns with q_1; in reaches of the arm."""
-    first, reach = machine.joints[0], extent(machine)[0]
-    ground = machine.ground / reach
-    for middle in (-0.075, 0.075):
-        wheels = product((-0.115, 0.115), (middle - 0.02, middle + 0.02), 0.035 * CIRCLE)
-        track = np.array([(x + dx, y, ground + 0.035 + dz) for x, y, (dx, dz) in wheels])
-        _solid(pen, view, reach * track, STEEL)
-    front, high = max(first.a / reach, 0.03), max(first.d / reach, 0.1)
-    turret = np.array([*product((-0.12, front), (-0.055, 0.055), (ground + 0.06, high))])
-    c, s = np.cos(q[0] + first.theta), np.sin(q[0] + first.theta)
-    _solid(pen, view, reach * turret @ [[c, s, 0], [-s, c, 0], [0, 0, 1]], INK)
-
-
-def _solid(pen: Pen, view: View, corners: Array, colour: Colour) -> None:
-    """A convex solid with these corners (K, 3) [m]."""
-    points = view.project(corners)
-    pen.polygon(_flat(points[ConvexHull(points).vertices]), colour)
-
-
 def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
-    """Links, of which the last one is a breaker, and joints."""
+    """Links, the first of them from the ground, and joints."""
     ends = view.project(forward_kinematics(machine, scene.q).p)
     sizes = 0.03 * extent(machine)[0] * view.scale * np.linspace(1.0, 0.5, machine.n)
-    for i in range(1, machine.n):
+    for i in range(machine.n):
         along = ends[i + 1] - ends[i]
         across = sizes[i] * along[::-1] * (-1, 1) / max(float(np.hypot(*along)), 1e-9)
-        part = BREAKER if i == machine.n - 1 else BOOM
-        middle, wide = ends[i] + part[:, :1] * along, part[:, 1:] * across
+        middle, wide = ends[i] + LINK[:, :1] * along, LINK[:, 1:] * across
         pen.polygon(_flat(np.vstack([middle + wide, (middle - wide)[::-1]])), scene.colour, INK)
         radius = max(6.0, 0.6 * float(sizes[i]))
         pen.polygon(_flat(ends[i] + 1.2 * radius * CIRCLE), INK)
