@@ -114,17 +114,6 @@ def test_load_policy__refuses_a_file_without_any_one_of_its_fields(tmp_path):
 # --- what was written -----------------------------------------------------------------------------
 
 
-@given(st.lists(names, unique=True, max_size=3), st.text())
-def test_save_arrays__are_loaded_bit_for_bit(folder, keys, text):
-    arrays = {f"w_{key}": np.arange(6, dtype=np.float32).reshape(2, 3) / 7 for key in keys}
-    save_arrays(folder / "y.npz", "net 1", {"text": text}, **arrays)
-    header, loaded = load_arrays(folder / "y.npz", "net 1")
-    assert header == {"text": text} and loaded.keys() == arrays.keys()
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(loaded[name], array)
-        assert loaded[name].dtype == array.dtype
-
-
 @given(npst.arrays(np.float64, (4, 2), elements=st.floats(allow_infinity=False, allow_nan=False)))
 def test_write_csv__is_read_bit_for_bit(folder, values):
     write_csv(

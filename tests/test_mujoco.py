@@ -1,8 +1,6 @@
 """The machine in MuJoCo has our geometry, obeys, feels its load, and goes through the chain."""
 
-import json
 import os
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +9,9 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from brokk_min.__main__ import main
 from brokk_min._files import SHIPPED
 from brokk_min.actuator import lever_arm
 from brokk_min.cli.options import find_plant
-from brokk_min.evaluation import baselines
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import PWM_MAX
@@ -79,26 +75,6 @@ def test_one_pump__slows_joints_that_move_together():
     down, middle = np.full((1, M.n), -M.pwm_limit / PWM_MAX), (HIGH + LOW) / 2
     moved = [run(MujocoBrokk(pump=p), [middle], down, 30)[-1] - middle for p in (1.0, 0.5)]
     assert (moved[1] < 0).all() and (moved[1] > 0.8 * moved[0]).all()
-
-
-def test_chain__runs_on_the_machine_in_mujoco(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(baselines, "EFFORT", (1, 1, 1.0))
-    Path("up.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\nup,2,0,0,0\n")
-    commands = (
-        f"collect --plant '{EXAMPLE}:PLANT' --hours 0.02 --out log.npz",
-        "inspect log.npz --json inspected.json",
-        "fit log.npz --out net.npz --steps 30 --batch-size 64",
-        "train --actuator net.npz --out policy.npz --total-steps 8192",
-        f"evaluate --policy policy.npz --plant '{EXAMPLE}:PLANT' --commands up.csv --num-starts 1 "
-        "--json runs.json",
-    )
-    for line in commands:
-        assert main(shlex.split(line)) == 0, line
-    joints = json.loads(Path("inspected.json").read_text())["joints"]
-    assert {name: joint["sign"] for name, joint in joints.items()} == dict.fromkeys(M.names, 1)
-    runs = json.loads(Path("runs.json").read_text())["runs"]
-    assert all(0 < run["velocity_error_mean"] < 0.5 for run in runs) and len(runs) > 3
 
 
 def test_film__is_written_or_says_that_there_is_no_opengl(tmp_path):

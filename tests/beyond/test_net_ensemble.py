@@ -8,7 +8,6 @@ from helpers_machines import random_net
 
 from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet
-from brokk_min.identification.net_file import joint_nets
 
 ZONES = np.array([[0.1, 0.2], [0.0, 0.05], [0.07, 0.07]])
 
@@ -34,11 +33,3 @@ def test_predict__is_the_mean_of_the_nets(shape):
     found = ensemble_of(nets).predict(history)
     assert found.shape == (*shape, 3) and found.dtype == np.float32
     np.testing.assert_allclose(found, each.mean(axis=0), atol=1e-6)
-
-
-def test_joint_nets__picks_joints_not_members():
-    nets = valve_nets(2)
-    history = np.random.default_rng(4).uniform(-1, 1, (5, 3, 3, 13)).astype(np.float32)
-    picked = joint_nets(ensemble_of(nets), ["j2", "j0"])
-    expected = ensemble_of(nets).predict(history)[:, [2, 0]]
-    np.testing.assert_allclose(picked.predict(history[:, [2, 0]]), expected, atol=1e-6)

@@ -124,14 +124,6 @@ def test_inspect__reads_drives_and_tables_together(tmp_path, capsys):
     assert float(q5) == pytest.approx(world.simulated.state.q[4], abs=0.02)
 
 
-def test_inspect__says_how_to_map_the_columns_of_other_loggers(tmp_path, capsys):
-    log = tmp_path / "theirs.csv"
-    log.write_text("ms,Boom,Lever\n0,30.1,500\n")
-    assert run("inspect", log) == 1
-    refusal = f"brokk-min: {log}: columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got ["
-    assert capsys.readouterr().err.startswith(refusal)
-
-
 def test_inspect__reads_recordings_of_ros(tmp_path, capsys):
     pytest.importorskip("rosbags")
     from helpers_ros import drive, multi_array, record

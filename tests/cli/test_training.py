@@ -37,23 +37,6 @@ def test_train__has_its_settings_from_the_line(tmp_path, capsys, options, interf
     assert learner.items() <= recipe["learner"].items()
 
 
-@pytest.mark.parametrize(
-    "option",
-    [
-        "--epochs 0",
-        "--seed -1",
-        "--zero-goals 2.5",
-        "--episode-s nan",
-        "--gamma 1.0",
-        "--hold-max-s 0.4",
-    ],
-)
-def test_train__refuses_settings_that_cannot_be(option, tmp_path, capsys):
-    assert run(f"train --actuator net.npz --out {tmp_path}/p.npz {option}") == 2
-    name, value = option.split()
-    assert re.fullmatch(rf"brokk-min: {name}: expected .*, got {value}\n", capsys.readouterr().err)
-
-
 def test_train__goes_on_only_if_it_is_told_to(tmp_path, capsys):
     (tmp_path / "p.npz.checkpoint").touch()
     line = f"train --actuator missing.npz --out {tmp_path}/p.npz"

@@ -8,8 +8,6 @@ import torch
 from helpers_machines import POSE, small_net
 
 from brokk_min import env
-from brokk_min.beyond.valve_nets import ValveNet
-from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import actor_weights
 from brokk_min.learning.policy import Policy, PolicyController, load_policy, save_policy
 from brokk_min.machine import BROKK_170
@@ -60,20 +58,6 @@ def test_controller__remembers_how_long_its_goal_is_zero(kind):
         u, memory = controller(measured, memory)
         assert u[0].any()
         assert u[1].any() == (kind == "paper" or tick < 2)
-
-
-@pytest.mark.parametrize("kind", ["paper", "beyond"])
-def test_file__gives_the_same_bits_back(tmp_path, kind):
-    zones = BROKK_170.dead_zones[BROKK_170.driven].astype(np.float32)
-    net = small_net(BROKK_170, np.random.default_rng(0), rows=4)
-    valve = ValveNet(**vars(net), dead_zones=zones)
-    before = replace(policy(kind), net=valve if kind == "beyond" else NET)
-    save_policy(tmp_path / "p.npz", before, BROKK_170)
-    after = load_policy(tmp_path / "p.npz", BROKK_170)
-    assert all(map(np.array_equal, before.weights, after.weights))
-    assert (after.interface, after.training) == (kind, {"seed": 0})
-    assert type(after.net) is type(before.net)
-    assert fingerprint(after.net) == fingerprint(before.net)
 
 
 @pytest.mark.parametrize(
