@@ -29,19 +29,4 @@ Glossary:
     free run      nets that go on from their own predictions under recorded commands
 """
 
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from brokk_min.machine import BROKK_170, Joint, Machine
-
 __version__ = "0.3.0"
-__all__ = ["BROKK_170", "Joint", "Machine", "__version__"]
-
-
-def __getattr__(name: str) -> Any:
-    """Names of `machine`, imported when asked for, so that `__main__` comes before NumPy."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from brokk_min import machine
-
-    return getattr(machine, name)

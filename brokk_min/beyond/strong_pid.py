@@ -14,7 +14,6 @@ Who was first: feed-forward by an inverted static map is Merritt's (Hydraulic Co
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from brokk_min.machine import PWM_MAX, Array, Machine, Measured, valve_opening
 
 ANGLES = 9  # of the static map, assumed
 COMMANDS = 41  # of the static map, assumed
+State = tuple[PIDState, Memory | None]  # what the controller keeps between ticks
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,6 @@ class StrongGains(Gains):
     integral_feedback: Array  # K_I of the error integral [1/s], (..., 1)
     start_boost: Array  # a valve closed lately opens 1 + start_boost times as wide [1], (..., 1)
     start_time: Array  # for so long after its first command [s], (..., 1)
-
-
-class StrongState(NamedTuple):
-    """What the controller keeps between ticks."""
-
-    pid: PIDState
-    memory: Memory | None
 
 
 @dataclass(frozen=True)
@@ -100,16 +93,16 @@ class StrongPID(JacobianController):
     gains: StrongGains
     feedforward: StaticMap
 
-    def start(self, num: int) -> StrongState:  # type: ignore[override]
+    def start(self, num: int) -> State:  # type: ignore[override]
         """State of `num` controllers at rest."""
-        return StrongState(super().start(num), None)
+        return super().start(num), None
 
     def __call__(  # type: ignore[override]
-        self, measured: Measured, state: StrongState
-    ) -> tuple[Array, StrongState]:
+        self, measured: Measured, state: State
+    ) -> tuple[Array, State]:
         """Commands u [-1, 1] (..., n), and the state of the next tick."""
-        m, gains, before = self.machine, self.gains, state.pid
-        memory = accumulate(m, state.memory, measured)
+        (before, memory), m, gains = state, self.machine, self.gains
+        memory = accumulate(m, memory, measured)
         q = measured.q.astype(float)
         q[..., m.driven] = smooth_angles(m, measured.history)
         v = measured.v_goal + gains.feedback * (measured.v_goal - measured.v_tool)
@@ -126,7 +119,7 @@ class StrongPID(JacobianController):
         closed = resting(m, memory)[..., None]
         increase = np.where(saturated | closed, 0.0, gains.ki * error * m.dt)  # anti-windup
         pid = PIDState(before.integral + increase, error, derivative, q_dot_goal)
-        return np.where(closed, 0.0, u), StrongState(pid, memory)
+        return np.where(closed, 0.0, u), (pid, memory)
 
     def widen(self, opening: Array, measured: Measured) -> Array:
         """Openings (..., n_driven), wider where a valve starts, at least `min_opening` in motion.

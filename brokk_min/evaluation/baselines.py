@@ -14,7 +14,7 @@ from brokk_min.actuator import PLANT, ActuatorNet, Plant
 from brokk_min.beyond.strong_pid import StrongGains, StrongPID, static_map
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
-from brokk_min.identification.net_file import fingerprint
+from brokk_min.identification.net_file import fingerprint, select_nets
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.machine import Array, Machine
 from brokk_min.settings import TaskConfig
@@ -51,12 +51,13 @@ def baselines(
     """
     w0 = manipulability_threshold(machine)
     gains = gains or first_gains(machine)
+    feedforward = static_map(machine, select_nets(machine, net))
     return {
         RAW: JacobianController(with_dead_zone(machine, 0), gains[RAW], 0.1, w0),
         BY_HAND: JacobianController(machine, gains[BY_HAND], 0.1, w0),
         OPTIMISED: JacobianController(machine, gains[OPTIMISED], 0.1, w0),
         PAPER_BASELINES[1]: JacobianController(machine, gains[OPTIMISED], 0.05, w0),
-        STRONGEST: StrongPID(machine, gains[STRONGEST], 0.1, w0, static_map(machine, net)),
+        STRONGEST: StrongPID(machine, gains[STRONGEST], 0.1, w0, feedforward),
     }
 
 

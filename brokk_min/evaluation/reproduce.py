@@ -14,7 +14,6 @@ from brokk_min.evaluation import baselines, claims, metrics, preliminary, report
 from brokk_min.identification import fitting, logs
 from brokk_min.identification.excitation import collect
 from brokk_min.identification.net_file import save_net, select_nets
-from brokk_min.jacobian import JacobianController
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, Policy, PolicyController
@@ -94,12 +93,6 @@ def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     return train_policy(chain.machine, driven, recipe, seed, chain.out / POLICIES[name])
 
 
-def tune(chain: Chain, net: ActuatorNet) -> dict[str, JacobianController]:
-    """The baselines, tuned."""
-    driven = select_nets(chain.machine, net)
-    return baselines.tuned_baselines(chain.machine, driven, chain.budget.tuning, chain.seed)
-
-
 def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
     """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names.
 
@@ -113,7 +106,8 @@ def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
     for name in sorted(POLICIES, reverse=True):  # the longest first
         jobs[name] = partial(train, chain, name)
         needs[name] = ["net_paper" if name == "rl_critic" else "net"]
-    jobs["pids"] = partial(tune, chain)
+    tuned = partial(baselines.tuned_baselines, chain.machine)
+    jobs["pids"] = partial(tuned, effort=chain.budget.tuning, seed=chain.seed)
     return side_by_side(jobs, needs)
 
 

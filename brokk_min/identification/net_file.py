@@ -69,15 +69,14 @@ def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
         "velocity_logged": False,  # a bus carries angles only
     }
     found = {name: getattr(net, name) for name in wanted}
-    if found != wanted:
-        raise ValueError(f"actuator: expected nets for {machine.name} with {wanted}, got {found}")
+    require(found == wanted, "actuator", f"nets for {machine.name} with {wanted}", found)
     return joint_nets(net, [machine.names[i] for i in machine.driven])
 
 
 def joint_nets(net: ActuatorNet, joints: Sequence[str]) -> ActuatorNet:
     """The nets of some joints, in the order given; ValueError: a joint without a net."""
-    if not set(joints) <= set(net.joints):
-        raise ValueError(f"joints: expected nets for {list(joints)}, got {list(net.joints)}")
+    known = set(joints) <= set(net.joints)
+    require(known, "joints", f"nets for {list(joints)}", list(net.joints))
     index = [net.joints.index(name) for name in joints]
     names = (*ARRAYS, "dead_zones") if isinstance(net, ValveNet) else ARRAYS
     arrays = {name: getattr(net, name)[index] for name in names}

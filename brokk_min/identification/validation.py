@@ -90,15 +90,11 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
 
 def warnings(scores: Mapping[str, Any]) -> list[str]:
     """A warning for each net of `score` that is no better than the last velocity again."""
-    errors = {
-        name: (one["one_step_rmse"], one["persistence_rmse"])
-        for name, one in scores.items()
-        if "one_step_rmse" in one
-    }
     return [
-        f"{name}: expected an error of one step below {last:.4f}, got {error:.4f}"
-        for name, (error, last) in errors.items()
-        if error > last
+        "{}: expected an error of one step below {persistence_rmse:.4f}, got "
+        "{one_step_rmse:.4f}".format(name, **one)
+        for name, one in scores.items()
+        if one.get("one_step_rmse", 0) > one.get("persistence_rmse", 0)
     ]
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
 from tqdm import tqdm
 
 from brokk_min import ppo
@@ -81,9 +80,7 @@ def prepare(
 
 def actor_weights(agent: Agent) -> tuple[np.ndarray, ...]:
     """w (inputs, outputs) and b of each layer of the actor."""
-    layers = [layer for layer in agent.actor if isinstance(layer, nn.Linear)]
-    pairs = ((layer.weight.T, layer.bias) for layer in layers)
-    return tuple(x.detach().numpy().copy() for pair in pairs for x in pair)
+    return tuple(weight.detach().numpy().T.copy() for weight in agent.actor.parameters())
 
 
 def stagger_episodes(env: TaskVectorEnv) -> None:

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from helpers_machines import DRIVEN, POSE, opened, steady
 
-from brokk_min.beyond.strong_pid import StaticMap, StrongGains, StrongPID, StrongState, static_map
+from brokk_min.beyond.strong_pid import State, StaticMap, StrongGains, StrongPID, static_map
 from brokk_min.env import Measured
 from brokk_min.jacobian import Gains, JacobianController
 from brokk_min.kinematics import forward_kinematics, jacobian
@@ -27,7 +27,7 @@ def controller(feedforward: StaticMap = NO_HELP, **gains: float) -> StrongPID:
     return StrongPID(BROKK_170, StrongGains(**arrays), 0.1, 1e-6, feedforward)
 
 
-def counts(c: StrongPID, now: Measured, state: StrongState | None = None) -> np.ndarray:
+def counts(c: StrongPID, now: Measured, state: State | None = None) -> np.ndarray:
     """Commands of the driven joints in counts of 127."""
     u, _ = c(now, state or c.start(1))
     assert u[0, 1] == 0
@@ -45,7 +45,7 @@ def test_without_its_additions__it_is_the_papers_controller():
         same, other = strong(now, other)
         least = (u == same) | ((same == 0) & (np.abs(127 * u) < 10))  # below half a count: closed
         assert least.all() and same.any()
-        np.testing.assert_allclose(other.pid, state, atol=1e-12)
+        np.testing.assert_allclose(other[0], state, atol=1e-12)
 
 
 def test_feedforward__adds_the_opening_of_the_nets_command():
@@ -70,17 +70,17 @@ def test_integral_feedback__adds_the_error_integral_to_the_goal():
     c = controller(integral_feedback=2.0)
     state = c.start(1)
     for _ in range(4):
-        _, state = c(measured(0.1 * GOAL), state._replace(pid=c.start(1).pid))
+        _, state = c(measured(0.1 * GOAL), (c.start(1)[0], state[1]))
     fades = np.exp(-0.0125 * np.arange(1, 4)).sum()
     lag = 0.006 * GOAL / np.linalg.norm(GOAL)  # |0.1 GOAL| = 7 mm/s
     v = 0.1 * GOAL + 2.0 * 0.05 * fades * lag
-    np.testing.assert_allclose(state.pid.q_dot_goal[0], np.linalg.pinv(J) @ v, rtol=1e-5)
+    np.testing.assert_allclose(state[0].q_dot_goal[0], np.linalg.pinv(J) @ v, rtol=1e-5)
 
 
 def test_integral__is_of_the_papers_tool_velocity():
     now = measured(GOAL, 0.1)
     _, state = controller()(now, controller().start(1))
-    np.testing.assert_array_equal(state.memory.v_tool, now.v_tool)
+    np.testing.assert_array_equal(state[1].v_tool, now.v_tool)
 
 
 def test_starts__open_a_closed_valve_wider_for_a_while():
@@ -114,7 +114,7 @@ def test_at_rest__it_closes_its_valves_after_a_tenth_of_a_second_and_integrates_
     for v_goal in (GOAL, *[0 * GOAL] * 6):
         u, state = c(measured(v_goal, 0.05), state)
         moves.append(u.any())
-        integrals.append(state.pid.integral[0])
+        integrals.append(state[0].integral[0])
     assert moves == [True] * 3 + [False] * 4
     np.testing.assert_array_equal(integrals[-1], integrals[-5])
     assert np.all(integrals[-6] != integrals[-5])
@@ -151,5 +151,5 @@ def test_widen__keeps_the_anti_windup_of_the_wider_valve():
     _, state = c(now, c.start(1))
     full = np.abs(counts(c, now)) == 80
     assert full.any() and not full.all()
-    assert (state.pid.integral[0] != 0).tolist() == (~full).tolist()
+    assert (state[0].integral[0] != 0).tolist() == (~full).tolist()
     assert (np.abs(counts(controller(kp=3.0), now)) < 80).all()

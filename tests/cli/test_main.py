@@ -42,7 +42,7 @@ def test_help__imports_nothing_slow():
 
 GERMAN = """
 from dataclasses import replace
-from brokk_min import BROKK_170
+from brokk_min.machine import BROKK_170
 *arm, bucket = BROKK_170.joints
 GERMAN = replace(BROKK_170, name="bagger", joints=(*arm, replace(bucket, name="Löffel")))
 """

@@ -13,7 +13,7 @@ from brokk_min.machine import BROKK_170
 FILE = """
 from dataclasses import replace
 from beside_it import NAME
-from brokk_min import BROKK_170
+from brokk_min.machine import BROKK_170
 from brokk_min.actuator import PLANT, AnalyticPlant
 DIGGER = replace(BROKK_170, name=NAME)
 NUMBER = 3

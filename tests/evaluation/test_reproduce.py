@@ -54,7 +54,7 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
     monkeypatch.setattr(reproduce, "QUICK", TINY)
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
     (tmp_path / "m.py").write_text(
-        "from dataclasses import replace\nfrom brokk_min import BROKK_170\n"
+        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
         "COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.025)\n"
     )
     out = tmp_path / "results"
