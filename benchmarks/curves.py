@@ -26,7 +26,7 @@ from brokk_min._files import write_json
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.checkpoint import actor_weights, prepare
 from brokk_min.learning.jobs import side_by_side
-from brokk_min.learning.policy import Policy, PolicyController
+from brokk_min.learning.policy import Policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170 as M
 
@@ -54,8 +54,8 @@ def learn(name: str, folder: Path, seed: int) -> list[dict[str, float]]:
         nonlocal began
         if now.update % max(1, updates // POINTS) == 0 or now.update == updates:
             hours = (time.process_time() - began) / 3600
-            policy = Policy({}, actor_weights(now.agent), net, recipe.interface)
-            error = machine_error(PolicyController(M, policy), RUNS)
+            policy = Policy(M, {}, actor_weights(now.agent), net, recipe.interface)
+            error = machine_error(policy, RUNS)
             rows.append({"steps": now.global_step, "hours": hours, "error": error})
             began = time.process_time() - 3600 * hours
 

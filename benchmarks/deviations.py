@@ -140,7 +140,7 @@ def train(steps: int) -> Figures:
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=steps))
     with TemporaryDirectory() as folder:
         trained = train_policy(M, net, recipe, 0, Path(folder) / "policy.npz")
-    controllers = {"rl": policy.PolicyController(M, trained)}
+    controllers = {"rl": trained}
     starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
     result = {}
     for name, plant in (("nets", net), ("plant", PLANT)):

@@ -32,7 +32,7 @@ from brokk_min.can.safety_gate import SLEW, expected_motion, gate_start, still_c
 from brokk_min.cli.operating import status
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import task_sequences
-from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -131,7 +131,7 @@ def frozen_table() -> list[dict[str, float]]:
 def recorded_drives() -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Angles [encoder counts] and commands [counts of 127] (T, n) of drives of the policy."""
     m, rng = BROKK_170, np.random.default_rng(0)
-    policy = PolicyController(m, load_policy(POLICY, m))
+    policy = load_policy(POLICY, m)
     start = np.array([m.q_start])
     for sequence in task_sequences(m):
         trace = rollout(m, policy, start, sequence.for_starts(m, start), 0.0, rng)

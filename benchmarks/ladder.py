@@ -69,7 +69,7 @@ def climb(name: str, nets: dict[str, ActuatorNet], total_steps: int, seed: int) 
     with TemporaryDirectory() as folder:
         trained = train_policy(M, net, recipe, seed, Path(folder) / "policy.npz")
     starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
-    controllers = {"rl": policy.PolicyController(M, trained)}
+    controllers = {"rl": trained}
     runs, _ = metrics.evaluate(M, controllers, sequences.axis_sequences(M), starts, 0)
     return [float(np.mean([run[key] for run in runs if run[key] is not None])) for key in FIGURES]
 

@@ -28,7 +28,7 @@ from brokk_min.identification import inspection, logs, validation
 from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.jobs import side_by_side
-from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170 as M
 from examples.mujoco_brokk import PLANT, MujocoBrokk
 
@@ -97,7 +97,7 @@ def make(options: Options, chain: Chain, net: ActuatorNet) -> None:
 def controllers(options: Options, chain: Chain, net: ActuatorNet) -> dict[str, Any]:
     """The policies and the PIDs of the folder by name."""
     files = {name: chain.out / POLICIES[name] for name in options.policies}
-    policies = {name: PolicyController(M, load_policy(file, M)) for name, file in files.items()}
+    policies = {name: load_policy(file, M) for name, file in files.items()}
     pids = baselines.read_gains(chain.out / "gains.json", M, select_nets(M, net))
     return policies | {name: pids[name] for name in PIDS}
 

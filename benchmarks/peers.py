@@ -35,7 +35,7 @@ from brokk_min.evaluation.rollout import Controller, rollout
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.learning.checkpoint import stagger_episodes
 from brokk_min.learning.gym_env import TaskVectorEnv
-from brokk_min.learning.policy import Policy, PolicyController, load_policy
+from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.settings import PPOConfig
@@ -215,9 +215,9 @@ class Clock:
         layers = [layer for layer in actor if isinstance(layer, nn.Linear)]
         pairs = [(layer.weight.T, layer.bias) for layer in layers]
         weights = tuple(x.detach().numpy().copy() for pair in pairs for x in pair)
-        policy = Policy({}, weights, self.net, "beyond")
+        policy = Policy(M, {}, weights, self.net, "beyond")
         goals = 2 if self.options.search else 1  # seeds of goals
-        return machine_error(PolicyController(M, policy), self.options.runs, goals)
+        return machine_error(policy, self.options.runs, goals)
 
 
 LEARNERS = {"groups": ours, "critic": ours, "sb3": sb3, "cleanrl": cleanrl}

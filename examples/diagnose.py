@@ -19,7 +19,7 @@ from brokk_min.actuator import NetState, append_sample, initial_history
 from brokk_min.can.drive_log import Telemetry, read_frames, read_telemetry
 from brokk_min.cli.options import Command
 from brokk_min.env import measure
-from brokk_min.learning.policy import Policy, PolicyController, load_policy
+from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.machine import PWM_MAX, Array, Machine
 
 # Thresholds between sound drives and planted faults; all are assumed.
@@ -83,12 +83,11 @@ def expected_commands(
     machine: Machine, policy: Policy, ticks: list[Telemetry], histories: list[Array]
 ) -> Array:
     """Commands (K, T, n) of the policy at each tick for each of K histories (T, n, 3, H)."""
-    controller = PolicyController(machine, policy)
     state, driving, commands = None, False, []
     for tick, history in zip(ticks, np.stack(histories, axis=1)):
-        state = state if driving else controller.start(len(history))  # as `hw.Drive` restarts
+        state = state if driving else policy.start(len(history))  # as `hw.Drive` restarts
         goal = np.tile(tick.v_goal.astype(np.float32), (len(history), 1))
-        u, state = controller(measure(machine, history, goal), state)
+        u, state = policy(measure(machine, history, goal), state)
         commands.append(u)
         driving = tick.driving
     return np.stack(commands, axis=1)

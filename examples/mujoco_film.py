@@ -22,7 +22,7 @@ except Exception as error:  # of PyOpenGL, if MUJOCO_GL names a library that is 
 
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import read_commands
-from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.settings import TaskConfig
 from brokk_min.viewer.drawing import Scene, draw
@@ -60,7 +60,7 @@ def main(options: Options) -> None:
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance = (0.0, 1.5, 0.9), 6.5
     camera.azimuth, camera.elevation = 155.0, -12.0
-    controller = PolicyController(M, load_policy(options.policy, M))
+    controller = load_policy(options.policy, M)
     goals = read_commands(options.commands, M)[0].goals[:, None]
     rng = np.random.default_rng(options.seed)
     trace = rollout(M, controller, [M.q_start], goals, TaskConfig.noise, rng, PLANT)

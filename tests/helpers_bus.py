@@ -45,7 +45,7 @@ def random_policy(interface, machine=BROKK_170):
     for inputs, outputs in pairwise(sizes):
         weights.append((1.5 * rng.standard_normal((inputs, outputs)) / inputs**0.5).astype("f4"))
         weights.append(np.zeros(outputs, np.float32))
-    return Policy({}, tuple(weights), obedient_net(machine), interface)
+    return Policy(machine, {}, tuple(weights), obedient_net(machine), interface)
 
 
 def unchanged(can_id, data):

@@ -1,4 +1,4 @@
-"""`examples/run_onnx.py` sends what `PolicyController` sends, without this package."""
+"""`examples/run_onnx.py` sends what `Policy` sends, without this package."""
 
 import re
 import subprocess
@@ -14,7 +14,6 @@ from brokk_min._files import SHIPPED
 from brokk_min.actuator import append_sample, initial_history
 from brokk_min.env import measure
 from brokk_min.learning.onnx import export_onnx
-from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170, read_encoder
 from examples.telescopic_crane import TELESCOPIC_CRANE
 
@@ -29,17 +28,17 @@ PROGRAM = Path(run_onnx.__file__)
 def test_commands__are_those_of_the_controller(machine, tmp_path):
     """While the goal changes, the joints obey, and those that are locked move by themselves."""
     policy = random_policy("paper", machine)
-    export_onnx(tmp_path / "p.onnx", policy, machine)
+    export_onnx(tmp_path / "p.onnx", policy)
     net, told = run_onnx.load(tmp_path / "p.onnx")
-    controller, rng = PolicyController(machine, policy), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     q = (machine.column("q_min") + machine.column("q_max")) / 2
-    u, memory, sent = np.zeros(machine.n), controller.start(1), []
+    u, memory, sent = np.zeros(machine.n), policy.start(1), []
     history = initial_history(np.float32(read_encoder(machine, q))[None], machine.history)
     h = history[0]
     window = machine.velocity_samples, machine.dt
     for v_goal in rng.uniform(-0.2, 0.2, (4, 3)).repeat(15, axis=0):
         history = append_sample(history, u, read_encoder(machine, q)[None], *window)
-        expected, memory = controller(measure(machine, history, v_goal[None]), memory)
+        expected, memory = policy(measure(machine, history, v_goal[None]), memory)
         h, u = run_onnx.tick(net, told, h, read_encoder(machine, q), u, v_goal)
         np.testing.assert_allclose(u, expected[0], atol=1e-6)
         q = q + machine.dt * np.where(np.isin(range(machine.n), machine.driven), 0.4 * u, 0.05)
@@ -50,7 +49,7 @@ def test_commands__are_those_of_the_controller(machine, tmp_path):
 def test_our_agent__is_refused_in_one_line(tmp_path):
     """It reads what it computes from memory, so NumPy alone would need its whole interface."""
     path = tmp_path / "p.onnx"
-    export_onnx(path, random_policy("beyond"), BROKK_170)
+    export_onnx(path, random_policy("beyond"))
     wanted = "expected a policy of train --paper, got beyond"
     with pytest.raises(SystemExit, match=f"^{path}: {wanted}$"):
         run_onnx.load(path)

@@ -11,7 +11,7 @@ from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation import baselines, metrics, sequences
 from brokk_min.evaluation.rollout import TITLES, Controller, valves_at_rest
 from brokk_min.jacobian import JacobianController
-from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import Array, Machine
 
 
@@ -39,10 +39,7 @@ class Evaluate(Command):
         policies |= {k: load_policy(file, machine) for k, file in files.items() if file.exists()}
         net = policies["rl"].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
-        controllers: dict[str, Controller] = {
-            name: PolicyController(machine, policy) for name, policy in policies.items()
-        }
-        controllers |= self.pids(machine, net, plant, gains)
+        controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
         task = self.task(machine)
         runs, _ = metrics.evaluate(machine, controllers, *task, self.seed, plant)
         if self.starts:

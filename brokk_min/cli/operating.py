@@ -19,7 +19,7 @@ from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
 from brokk_min.evaluation.rollout import TITLES, Controller
 from brokk_min.evaluation.sequences import read_commands
-from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import PWM_MAX, Machine, require
 
 
@@ -95,7 +95,7 @@ def find_controller(machine: Machine, policy: Path | None, rl: bool) -> Controll
     path, gains = default_policy(machine, policy)
     found = load_policy(path, machine)
     if rl:
-        return PolicyController(machine, found)
+        return found
     print(f"gains of the Jacobian controller: {gains or 'set by hand'}")
     known = read_gains(gains, machine, found.net) if gains else baselines(machine, found.net)
     return known[OPTIMISED]
@@ -168,5 +168,5 @@ class Export(Command):
         self.writes(self.out)
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # not on what is not needed here
         warnings.filterwarnings("ignore", category=FutureWarning, module="copyreg")  # torch's own
-        export_onnx(self.out, load_policy(self.policy, machine), machine)
+        export_onnx(self.out, load_policy(self.policy, machine))
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")

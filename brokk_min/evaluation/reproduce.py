@@ -16,7 +16,7 @@ from brokk_min.identification.excitation import collect
 from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
-from brokk_min.learning.policy import POLICIES, Policy, PolicyController
+from brokk_min.learning.policy import POLICIES, Policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import Array, Machine
 
@@ -117,7 +117,7 @@ def measure(
     """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
     net = select_nets(machine, done["net"])
-    controllers = {name: PolicyController(machine, done[name]) for name in POLICIES} | done["pids"]
+    controllers = {name: done[name] for name in POLICIES} | done["pids"]
     commands = sequences.task_sequences(machine)
     starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
     write_csv(chain.out / "starts.csv", machine.names, starts.tolist())

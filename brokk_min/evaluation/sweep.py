@@ -16,7 +16,7 @@ from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
-from brokk_min.learning.policy import PolicyController, load_policy
+from brokk_min.learning.policy import load_policy
 from brokk_min.learning.recipes import Recipe
 from brokk_min.machine import Machine
 
@@ -62,5 +62,4 @@ def run_seed(
         expect_same(file, policy.training, training)
     else:
         policy = train_policy(machine, net, recipe, seed, file)
-    controllers = {"rl": PolicyController(machine, policy)}
-    return evaluate(machine, controllers, commands, poses, 0)[0]
+    return evaluate(machine, {"rl": policy}, commands, poses, 0)[0]

@@ -53,8 +53,8 @@ def train_policy(
     with tqdm(desc="train", total=config.total_steps, unit="step", **options) as log.bar:
         agent = ppo.train(env, config, seed, advantages, log.on_update, start)
     log.write_curve()
-    policy = Policy(about, actor_weights(agent), net, recipe.interface)
-    save_policy(out, policy, machine)
+    policy = Policy(machine, about, actor_weights(agent), net, recipe.interface)
+    save_policy(out, policy)
     log.checkpoint.unlink(missing_ok=True)
     return policy
 

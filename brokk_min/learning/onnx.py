@@ -7,7 +7,6 @@ import torch
 
 from brokk_min._files import require_package, whole_file
 from brokk_min.learning.policy import INTERFACES, Policy, contract
-from brokk_min.machine import Machine
 
 OBSERVATION = (
     "each number less mean, over scale, newest samples last: goal and measured velocity of the "
@@ -19,7 +18,7 @@ OBSERVATION = (
 )
 
 
-def export_onnx(path: Path, policy: Policy, machine: Machine) -> None:
+def export_onnx(path: Path, policy: Policy) -> None:
     """Write a policy as one ONNX file: `observation` (batch, obs) in, `action` (batch, driven) out.
 
     The other program makes the observation and the command, as the policy's `env.Interface` does;
@@ -41,8 +40,8 @@ def export_onnx(path: Path, policy: Policy, machine: Machine) -> None:
         verbose=False,
     )
     assert program is not None
-    mean, scale = INTERFACES[policy.interface].scale(machine)
-    told = contract(machine) | {"interface": policy.interface}
+    mean, scale = INTERFACES[policy.interface].scale(policy.machine)
+    told = contract(policy.machine) | {"interface": policy.interface}
     told |= {"mean": mean.tolist(), "scale": scale.tolist(), "observation": OBSERVATION}
     told["action"] = "of pwm_limit / 127 of each driven joint, cut at 1 and rounded to counts"
     told["geometry_columns"] = ["a", "alpha", "d", "theta", "q_min", "q_max", "kind"]  # m and rad

@@ -25,16 +25,18 @@ POLICIES = {  # files of `reproduce`: our agent, the paper's, and the paper's as
 
 @dataclass(frozen=True)
 class Policy:
-    """The actor: standardised observation in, mean action out. Paper: Sec. 3.4 (256-128-64, ELU)"""
+    """The actor, and with it a `Controller` of the machine whose state is the agent's memory."""
 
+    machine: Machine
     training: Mapping[str, Any]  # seed and settings that made it
     weights: tuple[Array, ...]  # w, b of each layer, w (inputs, outputs)
     net: ActuatorNet  # the simulation it was trained in, kept with it
     interface: str  # its name in `INTERFACES`
 
     def act(self, observation: Array) -> Array:
-        """Actions (..., n_driven), not clipped, for observations (..., obs).
+        """Mean actions (..., n_driven), not clipped, for standardised observations (..., obs).
 
+        Paper: Sec. 3.4 (256-128-64, ELU)
         ValueError: a wrong shape, or an observation that is not finite.
         """
         x: Array = np.asarray(observation, np.float32)
@@ -48,22 +50,14 @@ class Policy:
         w, b = layers[-1]
         return np.asarray(x @ w + b)
 
-
-@dataclass(frozen=True)
-class PolicyController:
-    """A policy as an `evaluation.rollout.Controller`; its state is the agent's memory."""
-
-    machine: Machine
-    policy: Policy
-
     def start(self, num: int) -> None:
         """The agent remembers nothing yet."""
 
     def __call__(self, measured: Measured, memory: Any) -> tuple[Array, Any]:
         """Commands u (num, n), and the memory of this tick."""
-        machine, interface = self.machine, INTERFACES[self.policy.interface]
+        machine, interface = self.machine, INTERFACES[self.interface]
         memory = interface.remember(machine, memory, measured)
-        action = self.policy.act(interface.observe(machine, measured, memory))
+        action = self.act(interface.observe(machine, measured, memory))
         return interface.command(machine, action, memory), memory
 
 
@@ -82,16 +76,16 @@ def contract(machine: Machine) -> dict[str, Any]:
     }
 
 
-def save_policy(path: Path, policy: Policy, machine: Machine) -> None:
+def save_policy(path: Path, policy: Policy) -> None:
     """Write a policy as one `.npz`: weights, normalisation and its nets, plus a JSON header."""
     net_header, arrays = net_arrays(policy.net)
     header = {
         "interface": policy.interface,
-        "contract": contract(machine),
+        "contract": contract(policy.machine),
         "training": dict(policy.training),
         "net": net_header,
     }
-    mean, scale = INTERFACES[policy.interface].scale(machine)
+    mean, scale = INTERFACES[policy.interface].scale(policy.machine)
     weights = {f"layer_{i}": weight for i, weight in enumerate(policy.weights)}
     save_arrays(path, KIND, header, mean=mean, scale=scale, **weights, **arrays)
 
@@ -111,6 +105,6 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         require(fits, str(path), wanted, "another")
         weights = tuple(arrays[f"layer_{i}"] for i in range(8))
         net = select_nets(machine, net_from_arrays(path, header["net"], arrays))
-        policy = Policy(header["training"], weights, net, header["interface"])
+        policy = Policy(machine, header["training"], weights, net, header["interface"])
         policy.act(np.zeros((1, len(mean))))  # do shapes fit?
         return policy

@@ -8,7 +8,6 @@ from brokk_min.actuator import append_sample, initial_history
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.env import measure
 from brokk_min.evaluation.sequences import axis_sequences
-from brokk_min.learning.policy import PolicyController
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import read_encoder
 from examples.diagnose import diagnose
@@ -22,9 +21,8 @@ POLICIES = {name: random_policy(name) for name in ("paper", "beyond")}
 def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plant=1, name="paper"):
     """A drive with a fault: in what the policy gets, the valves get, or the encoders give."""
     policy = POLICIES[name]
-    controller, net = PolicyController(M, policy), policy.net
     goals = np.concatenate([sequence.goals[20:120] for sequence in axis_sequences(M)])
-    state, memory, history, u, ticks = net.reset(M, START), None, None, np.zeros((1, 5)), []
+    state, memory, history, u, ticks = policy.net.reset(M, START), None, None, np.zeros((1, 5)), []
     for t, goal in enumerate(goals):
         q = read_encoder(M, read(state.q))
         if history is None:
@@ -32,11 +30,11 @@ def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plan
         else:
             history = append_sample(history, u, q, M.velocity_samples, M.dt)
         v_goal = goal[None].astype(np.float32)
-        u, memory = controller(measure(M, observe(history.copy()), v_goal), memory)
+        u, memory = policy(measure(M, observe(history.copy()), v_goal), memory)
         time = t * ticks_of_plant / 20
         ticks.append(Telemetry(time, q[0], u[0].astype(float), goal, True))
         for _ in range(ticks_of_plant):
-            state = net.step(M, state, send(u))
+            state = policy.net.step(M, state, send(u))
     return ticks
 
 

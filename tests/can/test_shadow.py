@@ -14,7 +14,7 @@ from brokk_min.can.canopen import valve_frame
 from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.can.shadow import Shadow
 from brokk_min.cli.operating import status
-from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
 Q4 = 3
@@ -31,7 +31,7 @@ def shadowed(
     """A world with a remote control and a shadow, and the frames that leave the shadow."""
     if controller is None:
         path = SHIPPED / BROKK_170.name / POLICIES["rl"]
-        controller = PolicyController(BROKK_170, load_policy(path, BROKK_170))
+        controller = load_policy(path, BROKK_170)
     world, left = World(controller, operator, log=log), []
     world.noise = RemoteControl(world, partial(to_and_fro, moved), period)
     world.downward = lambda can_id, data: left.append((can_id, data)) or [(can_id, data)]

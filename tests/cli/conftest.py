@@ -29,7 +29,7 @@ def folder(tmp_path):
     """The policy does nothing, and the sequence lasts a second."""
     policy = random_policy("paper")
     policy = replace(policy, weights=tuple(np.zeros_like(w) for w in policy.weights))
-    save_policy(tmp_path / "policy.npz", policy, BROKK_170)
+    save_policy(tmp_path / "policy.npz", policy)
     meta = baselines.gains_metadata(BROKK_170, policy.net)
     baselines.write_gains(tmp_path / "gains.json", pids(BROKK_170, policy.net), meta)
     (tmp_path / "plant.py").write_text(OBEDIENT)

@@ -4,7 +4,7 @@ from helpers_bus import BASELINE, HoldingOperator, Virtual, World, only
 
 from brokk_min.can.operator_input import JointJog, Joystick
 from brokk_min.cli.operating import Drive, status
-from brokk_min.learning.policy import PolicyController
+from brokk_min.learning.policy import Policy
 from brokk_min.machine import BROKK_170
 
 
@@ -14,7 +14,7 @@ def test_drive__has_the_controller_that_is_named(folder):
         name: Drive(**where, controller=name, joint="q1").find_controller(BROKK_170)
         for name in ("rl", "jacobian", "jog")
     }
-    assert isinstance(controllers["rl"], PolicyController)
+    assert isinstance(controllers["rl"], Policy)
     assert controllers["jog"] == JointJog(BROKK_170, "q1", 12)
     assert (controllers["jacobian"].gains.ki == 8.0).all() and controllers["jacobian"].k == 0.1
     (folder / "gains.json").write_text("of other nets")  # which the policy does not need

@@ -12,7 +12,6 @@ from brokk_min.evaluation import metrics, sweep
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.identification.net_file import save_net
 from brokk_min.learning.checkpoint import train_policy
-from brokk_min.learning.policy import PolicyController
 from brokk_min.learning.recipes import Recipe
 from brokk_min.machine import BROKK_170
 from brokk_min.settings import PPOConfig, TaskConfig
@@ -73,8 +72,7 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path):
     assert [(tmp_path / "new" / name).stat().st_mtime_ns for name in names] == times
     policy = train_policy(BROKK_170, NET, RECIPE, 4, tmp_path / "alone.npz")
     assert (tmp_path / "new/seed_4.npz").read_bytes() == (tmp_path / "alone.npz").read_bytes()
-    controllers = {"rl": PolicyController(BROKK_170, policy)}
-    alone, _ = metrics.evaluate(BROKK_170, controllers, SEQUENCES, POSES, 0)
+    alone, _ = metrics.evaluate(BROKK_170, {"rl": policy}, SEQUENCES, POSES, 0)
     written = json.loads((tmp_path / "new" / "sweep.json").read_text())["runs"]
     assert [row["seed"] for row in written] == [3] * 6 + [4] * 6
     assert written[6:] == [{"seed": 4} | row for row in alone]

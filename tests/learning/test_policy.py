@@ -9,7 +9,7 @@ from helpers_machines import POSE, small_net
 
 from brokk_min import env
 from brokk_min.learning.checkpoint import actor_weights
-from brokk_min.learning.policy import Policy, PolicyController, load_policy, save_policy
+from brokk_min.learning.policy import Policy, load_policy, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import Agent
 
@@ -28,7 +28,7 @@ def agent(size):
 
 
 def policy(kind):
-    return Policy({"seed": 0}, actor_weights(agent(SIZES[kind])), NET, kind)
+    return Policy(BROKK_170, {"seed": 0}, actor_weights(agent(SIZES[kind])), NET, kind)
 
 
 def test_act__equals_the_actor_of_torch():
@@ -36,7 +36,7 @@ def test_act__equals_the_actor_of_torch():
     actor = agent(91)
     expected = actor.actor(torch.from_numpy(obs)).detach().numpy()
     assert expected.std() > 0.05
-    found = Policy({}, actor_weights(actor), NET, "beyond").act(obs)
+    found = Policy(BROKK_170, {}, actor_weights(actor), NET, "beyond").act(obs)
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
@@ -49,7 +49,7 @@ def test_act__refuses_wrong_shapes_and_what_is_not_finite():
 @pytest.mark.parametrize("kind", ["paper", "beyond"])
 def test_controller__remembers_how_long_its_goal_is_zero(kind):
     """Valves of our agent close after 0.1 s of a zero goal; the paper's go on."""
-    controller = PolicyController(BROKK_170, policy(kind))
+    controller = policy(kind)
     memory = controller.start(2)
     goals = np.array([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0]])
     state = env.initial_state(BROKK_170, np.tile(POSE, (2, 1)), goals)
@@ -70,7 +70,7 @@ def test_controller__remembers_how_long_its_goal_is_zero(kind):
     ],
 )
 def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message):
-    save_policy(tmp_path / "p.npz", policy("paper"), BROKK_170)
+    save_policy(tmp_path / "p.npz", policy("paper"))
     name = {"name": f"m {change}"} if "tool_speed" in change else {}  # caches go by the name
     machine = replace(BROKK_170, q_start=(), **change, **dict.fromkeys(name, "brokk170"))
     env.observation_scale.cache_clear()

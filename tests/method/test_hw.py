@@ -30,7 +30,7 @@ from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_velocity
-from brokk_min.learning.policy import POLICIES, PolicyController, load_policy
+from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
 
@@ -60,7 +60,7 @@ def controller_of(name):
     if name == "strong":  # it has a memory, as our agent
         return pids(BROKK_170, obedient_net(BROKK_170))[STRONGEST]
     path = SHIPPED / BROKK_170.name / POLICIES[name]
-    return PolicyController(BROKK_170, load_policy(path, BROKK_170))
+    return load_policy(path, BROKK_170)
 
 
 @pytest.mark.parametrize(
