@@ -174,7 +174,6 @@ class ActuatorNet:
     history: int  # H, samples of q, q_dot and u
     rate: float  # Hz
     velocity_samples: int  # window of the velocity estimator that made the inputs
-    velocity_logged: bool  # trained on the q_dot columns of a log, not on estimates
     machine: str  # name of the machine, or of the log
     input_mean: Array  # (n, I)
     input_scale: Array  # (n, I)

@@ -39,7 +39,6 @@ def random_net(seed=0, n=3, history=13, hidden=32, rows=3):
         history=history,
         rate=20.0,
         velocity_samples=4,
-        velocity_logged=False,
         machine="some",
         training={"seed": seed},
         input_mean=rng.uniform(-1, 1, (n, inputs)).astype(np.float32),
@@ -94,14 +93,13 @@ def obedient_net(machine):
     )
 
 
-def constant_net(velocity, logged, joints, rows=3):
+def constant_net(velocity, joints, rows=3):
     """Nets that say `velocity` whatever they see: no weights, sigmoid(0) = 1/2, the middle."""
     middle = np.array(velocity, np.float32)
     net = random_net(n=len(velocity), rows=rows)
     return replace(
         net,
         joints=joints,
-        velocity_logged=logged,
         weights=tuple(np.zeros_like(w) for w in net.weights),
         output_low=middle - 1,
         output_high=middle + 1,

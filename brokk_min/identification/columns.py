@@ -81,7 +81,7 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
         else:
             result[name] = values * factor
     for name in mapped:
-        command = "u_" + name.removeprefix("q_").removeprefix("dot_")
+        command = "u_" + name.removeprefix("q_")
         fits = not name.startswith("q_") or command in result
         require(fits, f"{path}: --map {name}", f"a column {command}, too", brief(list(result)))
     return result

@@ -50,7 +50,6 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
         "history": machine.history,
         "rate": log.rate,
         "velocity_samples": machine.velocity_samples,
-        "velocity_logged": log.velocity_logged,
         "machine": name,
         "training": {"seed": seed, "settings": asdict(config)},
         **{key: getattr(data, key).numpy() for key in ARRAYS},
@@ -74,7 +73,7 @@ class TrainingSet:
     long_windows: list[NDArray[np.intp]]  # those with `rollout` samples after them
     zones: Tensor | None  # dead zones (n, 2); None: the nets read the commands as they are
     history: int  # samples of a window
-    estimator: Tensor | None  # weights of the velocity estimator; None: logged velocities
+    estimator: Tensor  # weights of the velocity estimator
     input_mean: Tensor  # (n, I)
     input_scale: Tensor  # (n, I)
     reads: Tensor  # 1 for inputs that the nets read, (I,)
@@ -123,7 +122,7 @@ def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) ->
         long_windows=joined.windows(H, config.rollout),
         zones=torch.tensor(zones) if config.valve else None,
         history=H,
-        estimator=None if log.velocity_logged else torch.tensor(t / (t @ t)).float(),
+        estimator=torch.tensor(t / (t @ t)).float(),
         rate=log.rate,
         **dict(zip(names, tensors, strict=True)),
     )
@@ -224,7 +223,6 @@ def advance(data: TrainingSet, history: Tensor, velocity: Tensor, u: Tensor) -> 
     """Histories (batch, n, 3, H) one tick on: q' = q + dt velocity; then the command `u`."""
     q = history[..., 0, -1] + velocity / data.rate
     angles = torch.cat([history[..., 0, 1:], q[..., None]], dim=-1)
-    if data.estimator is not None:
-        velocity = angles[..., -len(data.estimator) :] @ data.estimator
+    velocity = angles[..., -len(data.estimator) :] @ data.estimator
     newest = torch.stack([q, velocity, u], dim=-1)
     return torch.cat([history[..., 1:], newest[..., None]], dim=-1)

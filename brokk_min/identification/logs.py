@@ -1,10 +1,10 @@
 """Logs of a machine: one table on disk, recordings at one rate in memory.
 
-Columns `run,time,u_<joint>...,q_<joint>...[,q_dot_<joint>...]`, one row per sample; `.csv`, or
-`.npz` with the same columns as arrays. `run` is the name of the recording, time is in s, u in
-[-1, 1] of full command (held until the next row), q in rad (m of prismatic joints), q_dot in q/s.
-Joints may have any names. The rate must not be below the machine's, and it may jitter. Recordings
-whose name ends in `_return` are dropped.
+Columns `run,time,u_<joint>...,q_<joint>...`, one row per sample; `.csv`, or `.npz` with the same
+columns as arrays. `run` is the name of the recording, time is in s, u in [-1, 1] of full command
+(held until the next row), q in rad (m of prismatic joints). Other columns are not read: velocities
+are estimated, because a bus carries angles alone. Joints may have any names. The rate must not be
+below the machine's, and it may jitter. Recordings whose name ends in `_return` are dropped.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,11 +39,10 @@ class Recording(NamedTuple):
 
 
 class Log(NamedTuple):
-    """Recordings of the same joints; `velocity_logged`: q_dot is measured, not estimated."""
+    """Recordings of the same joints."""
 
     joints: tuple[str, ...]
     recordings: tuple[Recording, ...]
-    velocity_logged: bool = False
     rate: float = RATE  # Hz
     warnings: tuple[str, ...] = ()  # of what was left out
 
@@ -97,13 +96,11 @@ def driven(recording: Recording) -> NDArray[np.bool_]:
 def join_recordings(log: Log) -> Samples:
     """Join the recordings of a log and add the target velocity of each sample.
 
-    The target is the mean velocity of the coming tick, (q(t+dt) - q(t)) / dt; for logged velocities
-    it is q_dot(t+dt). The last sample of a recording has none.
+    The target is the mean velocity of the coming tick, (q(t+dt) - q(t)) / dt. The last sample of a
+    recording has none.
     """
     u, q, q_dot = map(np.concatenate, list(zip(*log.recordings, strict=True))[1:])
     target = np.diff(q, axis=0, append=0) * log.rate
-    if log.velocity_logged:
-        target = np.roll(q_dot, -1, axis=0)
     lengths = [len(recording.q) for recording in log.recordings]
     moves = [driven(recording) for recording in log.recordings]
     return Samples(Recording("", u, q, q_dot), target, np.repeat(moves, lengths, axis=0), lengths)
@@ -136,15 +133,12 @@ def in_order(log: Log, joints: Sequence[str]) -> Log:
 def join_logs(logs: Mapping[Path, Log]) -> Log:
     """One log of several, by their files, with the joints in the order of the first one.
 
-    ValueError: they have other joints, some have logged velocities and others not, or all are
-    empty.
+    ValueError: they have other joints, or all are empty.
     """
     first = next(iter(logs.values()))
     joined: list[Log] = []
     for path, log in logs.items():
         with located(path):
-            same = log.velocity_logged == first.velocity_logged
-            require(same, "columns", "q_dot in all files or in none", "a mixture")
             joined.append(in_order(log, first.joints))
     recordings = tuple(one for log in joined for one in log.recordings)
     require(len(recordings) > 0, ", ".join(map(str, logs)), "at least one recording", "none")
@@ -158,7 +152,7 @@ def write_log(path: Path, log: Log) -> None:
     lengths = [len(recording.u) for recording in log.recordings]
     time = np.concatenate([np.arange(length) / log.rate for length in lengths])
     columns: dict[str, Any] = {"run": np.repeat(names, lengths), "time": time}
-    for kind in ("u", "q", "q_dot") if log.velocity_logged else ("u", "q"):
+    for kind in ("u", "q"):
         values = np.concatenate([getattr(recording, kind) for recording in log.recordings])
         columns |= {f"{kind}_{name}": values[:, i] for i, name in enumerate(log.joints)}
     if Path(path).suffix == ".csv":
@@ -176,9 +170,9 @@ def read_log(
 
     The command is held (of faster logs it is the mean over a tick), the angle interpolated. A gap
     longer than `MAX_GAP` and 2.5 samples cuts a recording, and so does an angle that jumps; rows in
-    which a joint was not read count as a gap. Without q_dot columns velocities are estimated: a
-    recording starts at rest, and after a gap the rows that would need samples of the gap are left
-    out. The joints may be others than those of the machine.
+    which a joint was not read count as a gap. A recording starts at rest; after a gap the rows are
+    left out whose velocity would need samples of the gap. The joints may be others than those of
+    the machine.
     ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
     table = load_table(path, mapped or {}, topics)
@@ -186,39 +180,38 @@ def read_log(
         joints = tuple(name[2:] for name in table if name.startswith("u_"))
         wanted = "u_<joint> (--map u_NAME=COLUMN:UNIT)"
         require(len(joints) > 0, "columns", wanted, brief(list(table)))
-        logged = any(name.startswith("q_dot_") for name in table)
-        recordings, warnings = _recordings(joints, table, logged, machine)
+        recordings, warnings = _recordings(joints, table, machine)
         told = tuple(f"{path}: {one}" for one in warnings)
-        return Log(joints, tuple(recordings), logged, machine.rate, told)
+        return Log(joints, tuple(recordings), machine.rate, told)
 
 
 def _recordings(
-    joints: Sequence[str], table: Mapping[str, Any], logged: bool, machine: Machine
+    joints: Sequence[str], table: Mapping[str, Any], machine: Machine
 ) -> tuple[list[Recording], list[str]]:
     """The recordings of a table, in the order in which they begin, and what was left out."""
-    kinds = ("u", "q", "q_dot") if logged else ("u", "q")
     time = _numbers(table, ["time"])[:, 0]
-    columns = {kind: _numbers(table, [f"{kind}_{name}" for name in joints]) for kind in kinds}
+    commands = _numbers(table, [f"u_{name}" for name in joints])
+    angles = _numbers(table, [f"q_{name}" for name in joints])
     runs = _runs(table["run"])
     speeds = dict(zip(machine.names, machine.q_dot_max, strict=True))
     fastest = np.array([speeds.get(name, 0.0) for name in joints])
-    wrong, speed = np.zeros(columns["q"].shape, bool), np.zeros(columns["q"].shape)
+    wrong, speed = np.zeros(angles.shape, bool), np.zeros(angles.shape)
     recordings = []
     for run, rows in runs.items():
-        t, values = time[rows], {kind: x[rows] for kind, x in columns.items()}
-        repeats = check_run(run, t, values["q"], machine.rate, joints)
-        bad, cuts = unread(t, values["q"], fastest, repeats)
+        t, u, q = time[rows], commands[rows], angles[rows]
+        repeats = check_run(run, t, q, machine.rate, joints)
+        bad, cuts = unread(t, q, fastest, repeats)
         wrong[rows] = bad | cuts
-        speed[rows[1:]] = np.abs(np.diff(values["q"], axis=0) / np.diff(t)[:, None])
+        speed[rows[1:]] = np.abs(np.diff(q, axis=0) / np.diff(t)[:, None])
         good = np.flatnonzero(~bad.any(axis=1))
         cut = np.diff(t[good]) > max(MAX_GAP, 2.5 / machine.rate)
         cut |= np.diff(np.cumsum(cuts.any(axis=1))[good]) > 0
         pieces = np.split(good, np.flatnonzero(cut) + 1)
         for part, piece in enumerate(pieces if len(good) else []):
-            skipped = machine.velocity_samples - 1 if part and not logged else 0
-            u, q, q_dot = (x[skipped:] for x in _resample(t, values, piece, machine))
-            if len(u):
-                recordings.append(Recording(f"{run}#{part + 1}" if part else run, u, q, q_dot))
+            skipped = machine.velocity_samples - 1 if part else 0
+            sampled = [x[skipped:] for x in _resample(t, u, q, piece, machine)]
+            if len(sampled[0]):
+                recordings.append(Recording(f"{run}#{part + 1}" if part else run, *sampled))
     return recordings, left_out(wrong, speed, joints)
 
 
@@ -247,18 +240,13 @@ def _numbers(table: Mapping[str, Any], names: Sequence[str]) -> Array:
 
 
 def _resample(
-    time: Array, columns: dict[str, Array], rows: Rows, machine: Machine
+    time: Array, u: Array, q: Array, rows: Rows, machine: Machine
 ) -> tuple[Array, Array, Array]:
-    """u held, q and q_dot of `rows` interpolated at the rate; q_dot estimated if there is none."""
+    """u held, q of `rows` interpolated at the machine's rate, and q_dot estimated."""
     t, rate = time[rows], machine.rate
     grid = t[0] + np.arange(int((t[-1] - t[0]) * rate + 1e-6) + 1) / rate
     fast = len(time) > 1 and np.median(np.diff(time)) < 0.501 / rate
     parts = np.linspace(0, 1 / rate, MEAN_OF if fast else 1, endpoint=False)[:, None]
     held = np.searchsorted(time, grid + parts + 1e-6, side="right") - 1
-    u = columns["u"][held].mean(axis=0)
-    q, *logged = (
-        np.stack([np.interp(grid, t, column) for column in columns[kind][rows].T], axis=-1)
-        for kind in columns
-        if kind != "u"
-    )
-    return u, q, logged[0] if logged else velocity_of(q, machine.velocity_samples, rate)
+    q = np.stack([np.interp(grid, t, angles) for angles in q[rows].T], axis=-1)
+    return u[held].mean(axis=0), q, velocity_of(q, machine.velocity_samples, rate)

@@ -16,7 +16,7 @@ from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.machine import Array, Machine, require
 
 KIND = "actuator net 4"
-HEADER = ("joints", "history", "rate", "velocity_samples", "velocity_logged", "machine", "training")
+HEADER = ("joints", "history", "rate", "velocity_samples", "machine", "training")
 ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 CLASSES = {"paper": ActuatorNet, "valve": ValveNet, "ensemble": NetEnsemble}  # by name in files
 NAMES = {kind: name for name, kind in CLASSES.items()}
@@ -66,7 +66,6 @@ def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
         "rate": machine.rate,
         "history": machine.history,
         "velocity_samples": machine.velocity_samples,
-        "velocity_logged": False,  # a bus carries angles only
     }
     found = {name: getattr(net, name) for name in wanted}
     require(found == wanted, "actuator", f"nets for {machine.name} with {wanted}", found)

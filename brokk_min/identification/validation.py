@@ -25,8 +25,6 @@ def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple
     low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)
     q_next = np.clip(q + velocity / net.rate, low, high)
     history = append_sample(history, u, q_next, net.velocity_samples, 1 / net.rate)
-    if net.velocity_logged:
-        history[..., 1, -1] = (q_next - q) * net.rate
     return history, q_next
 
 
@@ -62,9 +60,9 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     `join_recordings`), `persistence_rmse` that of the newest velocity in the history. Free runs
     start every `horizon` seconds: `velocity_rmse` is over all samples, `relative_error` this by the
     joint's rms speed, `position_error_median` over their ends.
-    ValueError: other joints, rate or kind of velocity than the nets', or no recording long enough.
+    ValueError: other joints or rate than the nets', or no recording long enough.
     """
-    for name in ("joints", "rate", "velocity_logged"):
+    for name in ("joints", "rate"):
         if getattr(log, name) != getattr(net, name):
             raise ValueError(f"{name}: expected {getattr(net, name)}, got {getattr(log, name)}")
     samples = join_recordings(log)
@@ -103,8 +101,7 @@ def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
     if not len(starts):
         got = samples.lengths[:9]
         raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {got}")
-    q_error, v_error = free_run(net, samples, starts, 1)
-    error = v_error[0] if net.velocity_logged else q_error[0] * net.rate
+    error = free_run(net, samples, starts, 1)[0][0] * net.rate
     persistence = samples.joined.q_dot[starts] - samples.target[starts]
     result: dict[str, Any] = {}
     for j, name in enumerate(net.joints):

@@ -18,7 +18,7 @@ ZONES = np.array([[0.07, 0.07], [0.2, 0.1], [0.0, 0.3]])
 
 def valve_net(velocity: float) -> ValveNet:
     """Nets of four joints that say `velocity` whatever they read."""
-    net = constant_net([velocity] * 4, False, tuple("abcd"), rows=4)
+    net = constant_net([velocity] * 4, tuple("abcd"), rows=4)
     return ValveNet(**vars(net), dead_zones=np.full((4, 2), 0.07))
 
 

@@ -19,7 +19,7 @@ CONFIG = FitConfig(steps=40, batch_size=64)
 NO_ZONES = np.zeros((1, 2), np.float32)
 
 
-def simple_system(seed, recordings, ticks=300, logged=False):
+def simple_system(seed, recordings, ticks=300):
     """Two first-order joints, q_ddot = (gain u - q_dot) / tau, turned back at +-0.8 rad."""
     rng = np.random.default_rng(seed)
     gain, tau, shape = np.array([0.5, 1.0]), np.array([0.15, 0.3]), (recordings, 2)
@@ -28,20 +28,20 @@ def simple_system(seed, recordings, ticks=300, logged=False):
     for tick in range(ticks):
         if tick % 8 == 0:
             u = np.where(np.abs(q) > 0.8, -np.sign(q) * 0.6, rng.uniform(-1, 1, shape))
-        rows.append((u, q, q_dot))
+        rows.append((u, q))
         for _ in range(10):
             q, q_dot = q + 0.005 * q_dot, q_dot + 0.005 * (gain * u - q_dot) / tau
     result = []
-    for i, (u, q, q_dot) in enumerate(np.array(rows).transpose(2, 1, 0, 3)):
-        result.append(Recording(f"r{i}", u, q, q_dot if logged else velocity_of(q, 4)))
-    return Log(("boom", "stick"), tuple(result), logged)
+    for i, (u, q) in enumerate(np.array(rows).transpose(2, 1, 0, 3)):
+        result.append(Recording(f"r{i}", u, q, velocity_of(q, 4)))
+    return Log(("boom", "stick"), tuple(result))
 
 
 def test_fit__learns_a_simple_system():
-    log = simple_system(0, 25, logged=True)
+    log = simple_system(0, 25)
     net = fit(log, FitConfig(steps=500, batch_size=256), 0, BROKK_170)
     assert not isinstance(net, ValveNet)  # no machine, no dead zones
-    unseen = simple_system(1, 6, logged=True)
+    unseen = simple_system(1, 6)
     result = score(net, unseen)
     for j, name in enumerate(net.joints):
         assert result[name]["one_step_rmse"] < 0.6 * result[name]["persistence_rmse"], result
@@ -59,7 +59,7 @@ def test_fit__states_how_the_nets_were_fitted():
     machine = replace(BROKK_170, name="toy", joints=tuple(zones), history=5, velocity_samples=3)
     net = fit(log, FitConfig(steps=0), 7, machine, "toy")
     assert (net.joints, net.history, net.rate) == (("q4", "q1"), 5, 20.0)
-    assert (net.velocity_samples, net.velocity_logged, net.machine) == (3, False, "toy")
+    assert (net.velocity_samples, net.machine) == (3, "toy")
     assert net.training["seed"] == 7 and net.training["settings"]["steps"] == 0
     np.testing.assert_allclose(net.dead_zones, [[0.25, 0.1]] * 2)
     u = np.concatenate([r.u[4:-1] for r in log.recordings])
@@ -133,11 +133,9 @@ def test_training_set__has_windows_that_end_before_the_seams():
 
 
 @pytest.mark.parametrize("valve", [False, True])
-@pytest.mark.parametrize("logged", [False, True])
-def test_accumulated_loss__is_the_error_of_a_free_run(logged, valve):
+def test_accumulated_loss__is_the_error_of_a_free_run(valve):
     """Three ticks on the nets' own outputs, stops included; the first is the one-step loss."""
-    log = simple_system(0, 4, logged=logged)
-    log = log._replace(joints=("q1", "q3"))
+    log = simple_system(0, 4)._replace(joints=("q1", "q3"))
     config = FitConfig(steps=1, batch_size=4, rollout=3, valve=valve, members=1)
     net = fit(log, config, 0, BROKK_170, "brokk170")
     net.weights[5][:] = 1.0  # upwards, by what the nets read

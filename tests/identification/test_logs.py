@@ -46,10 +46,10 @@ def both(first, second):
     return {name: np.concatenate([first[name], second[name]]) for name in first}
 
 
-def resampled(columns, joint, interpolated="q"):
-    """Command held and angle (or velocity) interpolated at 20 Hz, sample by sample."""
+def resampled(columns, joint):
+    """Command held and angle interpolated at 20 Hz, sample by sample."""
     time, u = columns["time"].tolist(), columns[f"u_{joint}"].tolist()
-    values = columns[f"{interpolated}_{joint}"].tolist()
+    values = columns[f"q_{joint}"].tolist()
     commands, result = [], []
     while (now := time[0] + len(result) * 0.05) <= time[-1] + 1e-9:
         last = max(i for i in range(len(time)) if time[i] <= now + 1e-9)
@@ -64,30 +64,30 @@ def resampled(columns, joint, interpolated="q"):
 # --- round trips ----------------------------------------------------------------------------------
 
 
-def some_log(velocity_logged):
+def some_log():
     rng = np.random.default_rng(5)
     recordings = []
     for i, length in enumerate((30, 1, 7)):
         u, q_dot = rng.integers(-80, 81, (length, 3)) / 127, rng.uniform(-2, 2, (length, 3))
         q = rng.uniform(-2, 2, 3) + np.cumsum(rng.uniform(0.05, 0.06, (length, 3)), axis=0)
         recordings.append(Recording(f"run {i} wet", u, q, q_dot))
-    return Log(("boom", "stick", "q_dot_like"), tuple(recordings), velocity_logged)
+    return Log(("boom", "stick", "q_dot_like"), tuple(recordings))
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz"])
-@pytest.mark.parametrize("velocity_logged", [False, True])
-def test_write_log__reads_back(tmp_path, suffix, velocity_logged):
-    log = some_log(velocity_logged)
+def test_write_log__reads_back(tmp_path, suffix):
+    log = some_log()
     write_log(tmp_path / f"log{suffix}", log)
     again = read_log(tmp_path / f"log{suffix}", BROKK_170)
-    assert again.joints == log.joints and again.velocity_logged == velocity_logged
+    assert again.joints == log.joints
     assert [r.name for r in again.recordings] == [r.name for r in log.recordings]
     tolerance = 1e-12 if suffix == ".npz" else 2e-6
     for got, written in zip(again.recordings, log.recordings, strict=True):
         np.testing.assert_allclose(got.u, written.u, atol=tolerance)
         np.testing.assert_allclose(got.q, written.q, atol=tolerance)
-        q_dot = written.q_dot if velocity_logged else velocity_of(written.q, 4)
-        np.testing.assert_allclose(got.q_dot, q_dot, atol=max(tolerance, 1e-12) * 30)
+        np.testing.assert_allclose(
+            got.q_dot, velocity_of(written.q, 4), atol=max(tolerance, 1e-12) * 30
+        )
 
 
 # --- resampling -----------------------------------------------------------------------------------
@@ -105,15 +105,12 @@ def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed, start
     time = np.where(np.abs(ticks - np.rint(ticks)) < 1e-3, time + 1e-3, time)
     time[0] = start
     columns = table("x", time, seed, ("a",))
-    columns["q_dot_a"] = columns["q_a"][::-1]
     path = write(tmp_path_factory.getbasetemp() / "looped.npz", columns)
     (recording,) = read_log(path, BROKK_170).recordings
     u, q = resampled(columns, "a")
     np.testing.assert_array_equal(recording.u[:, 0], u)
     tolerance = 1e-5 if start > 1e9 else 1e-9
     np.testing.assert_allclose(recording.q[:, 0], q, atol=tolerance)
-    _, q_dot = resampled(columns, "a", "q_dot")
-    np.testing.assert_allclose(recording.q_dot[:, 0], q_dot, atol=tolerance)
 
 
 def test_read_log__takes_means_of_fast_commands_by_hand(tmp_path):
@@ -175,14 +172,12 @@ def test_read_log__does_not_assume_rest_after_a_gap(tmp_path, samples):
     time = np.arange(90) / 20
     time[60:] += 1.0
     columns = table("x", time, 0, ("a",)) | {"q_a": 0.3 * time, "u_a": np.arange(90) / 90}
+    columns |= {"q_dot_a": np.full(90, 9.0)}  # nobody reads it
     machine = replace(BROKK_170, velocity_samples=samples)
     first, second = read_log(write(tmp_path / "log.npz", columns), machine).recordings
     np.testing.assert_allclose(second.q_dot, 0.3, atol=1e-9)
     np.testing.assert_allclose(second.u[:, 0], columns["u_a"][59 + samples :])
     assert first.q_dot[0, 0] == 0.0  # but before a recording
-    logged = columns | {"q_dot_a": np.full(90, 0.3)}
-    _, whole = read_log(write(tmp_path / "log.npz", logged), machine).recordings
-    assert len(whole.q) == 30  # nothing is unknown
 
 
 def test_join_logs__joins_files_of_the_same_joints_only(tmp_path):
@@ -194,10 +189,6 @@ def test_join_logs__joins_files_of_the_same_joints_only(tmp_path):
     log = join_logs(logs)
     assert log.joints == ("a", "b") and [r.name for r in log.recordings] == ["x", "z"]
     np.testing.assert_allclose(log.recordings[1].q[:, 0], second["q_a"], atol=1e-9)
-    measured = first | {"q_dot_a": np.zeros(30), "q_dot_b": np.zeros(30)}
-    path = write(tmp_path / "3.csv", measured)
-    with pytest.raises(ValueError, match=r"3\.csv: columns: expected q_dot in all files"):
-        join_logs(logs | {path: read_log(path, BROKK_170)})
 
 
 # --- readings that are no measurements -----------------------------------------------------------
