@@ -26,8 +26,6 @@ BLUE, ORANGE = (0, 114, 178), (213, 94, 0)  # of the machine under the policy, u
 HEAD, ROW = 72, 40  # heights of the title and of a joint's row
 NO_POINTS = np.zeros((0, 3))
 ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up of the top view
-# Outline of a link: how far along it, and half its width there.
-LINK = np.array([[0, 1.0], [0.3, 1.2], [1, 0.7]])
 CIRCLE = np.exp(2j * np.pi * np.arange(24)[:, None] / 24).view(float)  # corners (x, y)
 
 
@@ -136,10 +134,7 @@ def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     ends = view.project(forward_kinematics(machine, scene.q).p)
     sizes = 0.03 * extent(machine)[0] * view.scale * np.linspace(1.0, 0.5, machine.n)
     for i in range(machine.n):
-        along = ends[i + 1] - ends[i]
-        across = sizes[i] * along[::-1] * (-1, 1) / max(float(np.hypot(*along)), 1e-9)
-        middle, wide = ends[i] + LINK[:, :1] * along, LINK[:, 1:] * across
-        pen.polygon(_flat(np.vstack([middle + wide, (middle - wide)[::-1]])), scene.colour, INK)
+        pen.line(_flat(ends[i : i + 2]), scene.colour, round(2 * float(sizes[i])))
         radius = max(6.0, 0.6 * float(sizes[i]))
         pen.polygon(_flat(ends[i] + 1.2 * radius * CIRCLE), INK)
         pen.polygon(_flat(ends[i] + 0.5 * radius * CIRCLE), BACKGROUND)
