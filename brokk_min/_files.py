@@ -153,7 +153,7 @@ def numbers(path: Path, name: str, cells: Iterable[str]) -> NDArray[Any]:
 
 
 def save_arrays(path: Path, kind: str, header: Mapping[str, Any], **arrays: Any) -> None:
-    """Write arrays and a JSON header as one `.npz`; `kind` says what it is, as "policy 6"."""
+    """Write arrays and a JSON header as one `.npz`; `kind` says what it is, as "policy 7"."""
     text = np.array(json.dumps({"kind": kind, **header}))
     with whole_file(path) as file:
         np.savez_compressed(file, header=text, **arrays)

@@ -1,4 +1,4 @@
-"""The machine in MuJoCo has our geometry, obeys, feels its load, and goes through the chain."""
+"""The machine in MuJoCo has our geometry, obeys, and feels its load."""
 
 import os
 import subprocess

@@ -19,7 +19,7 @@ from brokk_min.machine import Array, require
 
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-KINDS = ("u_", "q_")  # of columns that are numbers, as time is
+KINDS = ("u_", "q_")  # of columns that are read, beside run and time
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
 Mapped = dict[str, tuple[str, float]]  # column of the log: that of the file, and its factor
 
@@ -63,8 +63,9 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
         table = load_arrays(path)[1]
     else:
         table = read_ros(path, *topics)
-    named = {name: (name, 1.0) for name in table if name == "time" or name.startswith(KINDS)}
-    named |= {"run": ("run", 1.0)} if "run" in table else {}
+    joints = [name[2:] for name in (*table, *mapped) if name.startswith("u_")]
+    read = ("run", "time", *(f"{kind}{joint}" for joint in joints for kind in KINDS))
+    named = {name: (name, 1.0) for name in read if name in table}
     rows = max(map(np.size, table.values()), default=0)
     result: dict[str, Any] = {"run": np.repeat(path.stem, rows), **table}  # others, for messages
     for name, (column, factor) in (named | mapped).items():

@@ -15,7 +15,7 @@ from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.machine import Array, Machine, require
 
-KIND = "actuator net 4"
+KIND = "actuator net 5"
 HEADER = ("joints", "history", "rate", "velocity_samples", "machine", "training")
 ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 CLASSES = {"paper": ActuatorNet, "valve": ValveNet, "ensemble": NetEnsemble}  # by name in files

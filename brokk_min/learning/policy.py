@@ -14,7 +14,7 @@ from brokk_min.env import PAPER
 from brokk_min.identification.net_file import net_arrays, net_from_arrays, select_nets
 from brokk_min.machine import Array, Machine, Measured, require
 
-KIND = "policy 6"
+KIND = "policy 7"
 INTERFACES = {"paper": PAPER, "beyond": INTERFACE}  # by their names in files
 POLICIES = {  # files of `reproduce`: our agent, the paper's, and the paper's as printed
     "rl": "policy.npz",
@@ -25,7 +25,7 @@ POLICIES = {  # files of `reproduce`: our agent, the paper's, and the paper's as
 
 @dataclass(frozen=True)
 class Policy:
-    """The actor, and with it a `Controller` of the machine whose state is the agent's memory."""
+    """The actor. It is also a `Controller` of its machine, with the agent's memory as its state."""
 
     machine: Machine
     training: Mapping[str, Any]  # seed and settings that made it

@@ -130,7 +130,7 @@ def _backdrop(pen: Pen, machine: Machine, view: View) -> None:
 
 
 def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
-    """Links, the first of them from the ground, and joints."""
+    """Links, the first of them from the base frame's origin, and joints."""
     ends = view.project(forward_kinematics(machine, scene.q).p)
     sizes = 0.03 * extent(machine)[0] * view.scale * np.linspace(1.0, 0.5, machine.n)
     for i in range(machine.n):

@@ -14,6 +14,7 @@ import exercises
 from brokk_min import actuator, env, jacobian, kinematics, machine
 from exercises.__main__ import FILES, main
 from exercises.hunt import bugs, judge
+from exercises.symptoms import SYMPTOMS, measure
 from exercises.verdict import judge as verdict
 
 ROOT = Path(exercises.__file__).parents[1]
@@ -124,6 +125,12 @@ def test_solutions__stand_where_the_exercise_says(number):
         path, _, names = part.strip().partition(": ")
         for name in re.findall(r"\w+", names):
             assert re.search(rf"(def|class) {name}\b", (ROOT / path).read_text()), name
+
+
+@pytest.mark.parametrize("name", [*SYMPTOMS])
+def test_measure__shows_numbers_of_the_sound_package(name):
+    rows = measure(name)
+    assert rows and "raised" not in rows, rows
 
 
 @pytest.mark.parametrize("bug", bugs(), ids=lambda bug: f"{bug.file}:{bug.line}")

@@ -189,6 +189,9 @@ def test_join_logs__joins_files_of_the_same_joints_only(tmp_path):
     log = join_logs(logs)
     assert log.joints == ("a", "b") and [r.name for r in log.recordings] == ["x", "z"]
     np.testing.assert_allclose(log.recordings[1].q[:, 0], second["q_a"], atol=1e-9)
+    path = write(tmp_path / "3.csv", table("w", time, 3, ("a", "c")))
+    with pytest.raises(ValueError, match=r"3\.csv: joints: expected \['a', 'b'\], got"):
+        join_logs(logs | {path: read_log(path, BROKK_170)})
 
 
 # --- readings that are no measurements -----------------------------------------------------------

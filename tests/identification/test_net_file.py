@@ -49,7 +49,7 @@ def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "policy 5"}, "expected .*actuator net 4 .*fit again.*, got 'policy 5'"),
+        ({"kind": "policy 5"}, "expected .*actuator net 5 .*fit again.*, got 'policy 5'"),
         ({"reads": "valve"}, "expected a complete actuator net, got .*dead_zones"),
         ({"joints": ["a", "b"]}, "expected a complete actuator net, got "),
     ],
@@ -57,7 +57,7 @@ def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
 def test_load_net__names_file_and_fault(tmp_path, change, message):
     path = tmp_path / "net.npz"
     header, arrays = net_arrays(random_net())
-    save_arrays(path, "actuator net 4", header | change, **arrays)
+    save_arrays(path, "actuator net 5", header | change, **arrays)
     with pytest.raises(ValueError, match=rf"^{path}: {message}"):
         load_net(path)
 

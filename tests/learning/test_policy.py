@@ -1,4 +1,4 @@
-"""The policy's file and function: by hand, against torch, bit for bit through a file, refusals."""
+"""The policy: by hand, against torch, refusals of its file."""
 
 from dataclasses import replace
 
@@ -8,8 +8,10 @@ import torch
 from helpers_machines import POSE, small_net
 
 from brokk_min import env
+from brokk_min._files import SHIPPED
+from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import actor_weights
-from brokk_min.learning.policy import Policy, load_policy, save_policy
+from brokk_min.learning.policy import POLICIES, Policy, load_policy, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import Agent
 
@@ -77,3 +79,9 @@ def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message)
     with pytest.raises(ValueError, match=message):
         load_policy(tmp_path / "p.npz", machine)
     env.observation_scale.cache_clear()
+
+
+@pytest.mark.parametrize("file", POLICIES.values())
+def test_shipped_policies__name_the_nets_that_they_hold(file):
+    policy = load_policy(SHIPPED / BROKK_170.name / file, BROKK_170)
+    assert policy.training["actuator"] == fingerprint(policy.net)
