@@ -4,7 +4,8 @@ What it changes: of the paper's observation (`env`) our agent reads the newer ha
 commands, and one smoothed angle of each joint; its velocity of the tool is as old as those of the
 joints. It also reads which of these commands opened valves, the joint velocities that would give
 the goal, and those that would undo the velocity error so far. Its actions begin beyond the dead
-zone, its valves close while the tool rests, and it pays for valve travel and for error that lasts.
+zone, its valves close while the tool rests, and it pays for large commands, valve travel and error
+that lasts.
 
 What it buys, in order, trained with `group_advantages` on our nets for one million steps (means of
 three seeds along x, y and z, `benchmarks.ladder`):
@@ -52,6 +53,7 @@ ALONG, ACROSS = 0.02, 0.07  # of tool_speed, tuned: velocity errors count up to 
 COMPENSATION = 0.01  # of an action, assumed: up to here a command rises to the dead zone
 REST_AFTER = 0.1  # s of a zero goal, after which the valves close (tuned)
 FADE = 2 / 13  # of the history, tuned: e-fold of the weights of older velocities and commands
+EFFORT_COST = 0.03  # tuned: if all commands are at the limit
 TRAVEL_COST = 0.1  # tuned: if all commands change by the limit in a tick
 INTEGRAL_COST = 1.5  # tuned: of a metre of the error integral in a tick
 
@@ -187,10 +189,16 @@ def command(machine: Machine, action: Array, memory: Memory) -> Array:
 
 
 def cost(machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
-    """Cost (...) of a tick: 0.1 of the mean of |u - u_before| / limit, and 1.5 |integral| [m]."""
-    change = np.abs(u - u_before)[..., machine.driven].mean(axis=-1) * PWM_MAX / machine.pwm_limit
+    """0.03 mean (u / limit)^2 + 0.1 mean |u - u_before| / limit + 1.5 |integral| [m], (...).
+
+    Four driven joints move the tool along three axes, so some of their motions cancel at the tool.
+    The first term keeps the policy from such motions, which in the end reach a stop.
+    """
+    limit = machine.pwm_limit / PWM_MAX
+    effort = np.square(u[..., machine.driven] / limit).mean(axis=-1)
+    travel = np.abs((u - u_before)[..., machine.driven] / limit).mean(axis=-1)
     integral = np.linalg.norm(memory.error_integral, axis=-1)
-    return np.asarray(TRAVEL_COST * change + INTEGRAL_COST * integral)
+    return np.asarray(EFFORT_COST * effort + TRAVEL_COST * travel + INTEGRAL_COST * integral)
 
 
 INTERFACE = env.Interface(observation_scale, remember, observe, command, cost)

@@ -125,10 +125,7 @@ def test_the_brokk__has_the_numbers_of_the_paper_and_the_design():
 
 
 def test_a_replaced_machine__has_columns_and_joints_of_its_own():
-    """Machines are values: those of one name and one hash are told apart by their numbers."""
-    for value in (BROKK_170, BROKK_170.joints[0]):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            value.name = "other"
+    """Those of one name and one hash are told apart by their numbers."""
     assert replace(BROKK_170, rate=10.0).dt == 0.1 and BROKK_170.dt == 0.05
     machine = changed(1, a=9.0, driven=True, dead_zone=(0.1, 0.2))
     assert hash(machine) == hash(BROKK_170) and machine != BROKK_170
@@ -170,12 +167,6 @@ def test_encode_pwm__refuses_commands_that_no_byte_can_carry(u):
 # --- the limit and the dead zone ------------------------------------------------------------------
 
 
-def test_limit_command__is_80_counts_of_127():
-    limited = limit_command(BROKK_170, np.array([-1.0, -0.63, 0.0, 0.004, 0.1, 0.62, 0.64, 5.0]))
-    np.testing.assert_allclose(limited * 127, [-80, -80, 0, 1, 13, 79, 80, 80], atol=1e-12)
-    assert pytest.approx(0.63, abs=1e-3) == 80 / 127
-
-
 @given(
     machines(),
     st.sampled_from([np.float32, np.float64]).flatmap(
@@ -194,14 +185,7 @@ def test_limit_command__sends_whole_counts_within_the_limit(machine, u):
     assert np.all(np.abs(counts - nearest) <= 0.5 + 1e-4)
     np.testing.assert_array_equal(limit_command(machine, -u), -limited)
     np.testing.assert_array_equal(limit_command(machine, limited), limited)
-
-
-def test_whole_numbers__are_commands_and_angles_too():
-    """[1, -1] is full command both ways; that it came as integers must not make it zero."""
-    np.testing.assert_allclose(limit_command(BROKK_170, [1, -1, 0]) * 127, [80, -80, 0])
-    np.testing.assert_array_equal(
-        read_encoder(BROKK_170, [1, 2, 0, 1, 1]), read_encoder(BROKK_170, [1.0, 2.0, 0, 1, 1])
-    )
+    assert limit_command(machine, [1])[0] > 0.1  # whole numbers are commands, too
 
 
 def test_valve_opening__by_hand():
@@ -239,9 +223,4 @@ def test_encoders__report_the_nearest_count(machine_and_pose):
     assert np.all(np.abs(measured - q) <= step / 2 * (1 + 1e-9))
     np.testing.assert_array_equal(read_encoder(machine, measured), measured)
     assert read_encoder(machine, q.astype(np.float32)).dtype == np.float32
-
-
-def test_read_encoder__by_hand():
-    # 1 rad = 651.9 counts of 1.53398 mrad
-    q = read_encoder(BROKK_170, [1.0, -0.0007, -0.0008, 0.0, 0.0])
-    np.testing.assert_allclose(q, [652 * 2 * np.pi / 4096, 0, -0.00153398, 0, 0], rtol=1e-5)
+    assert read_encoder(machine, np.ones(machine.n, int)).dtype == float

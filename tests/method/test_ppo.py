@@ -1,6 +1,5 @@
 """PPO: formulas by hand and against torch, a training written once more, refusals, Pendulum."""
 
-import math
 from dataclasses import replace
 
 import gymnasium
@@ -67,13 +66,6 @@ class Tape(VectorEnv):
         return obs, self.rewards[t], self.terminated[t], self.truncated[t], info
 
 
-class FirstNumber(nn.Module):
-    """A critic whose value is the first number of the observation."""
-
-    def forward(self, obs):
-        return obs[..., :1]
-
-
 def lambda_return_advantages(rewards, terminated, truncated, values, last_values, config):
     """All n-step returns under the weights (1 - lambda) lambda^(n-1), minus the value."""
     gamma, lam = config.gamma, config.gae_lambda
@@ -118,18 +110,6 @@ def test_agent__has_the_nets_of_the_paper():
 # --- formulas -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("action", "mean", "log_std", "expected"),
-    [
-        ([1.0, 3.0], [1.0, 1.0], [0.0, 0.0], -2.0 - math.log(2 * math.pi)),
-        ([2.0], [1.0], [math.log(0.5)], -2.0 + math.log(2) - 0.5 * math.log(2 * math.pi)),
-    ],
-)
-def test_log_probability__by_hand(action, mean, log_std, expected):
-    tensors = (torch.tensor(numbers) for numbers in (action, mean, log_std))
-    assert float(ppo.log_probability(*tensors)) == pytest.approx(expected)
-
-
 def test_gae__by_hand():
     """Three ticks, gamma = lambda = 0.5: one goes on, one is truncated, one terminates."""
     rewards = torch.tensor([[1.0] * 3, [2.0] * 3, [4.0] * 3])
@@ -149,7 +129,7 @@ def test_critic_advantages__are_means_of_n_step_returns(gamma, lam, seed):
     config = replace(SMALL, gamma=gamma, gae_lambda=lam)
     tape = Tape(seed)
     agent, _, obs, *_ = ppo.begin(tape, config, 0)
-    agent.critic = FirstNumber()
+    agent.critic = nn.Identity()
     rollout, _ = ppo.collect(tape, agent, obs, config.horizon)
     advantages, returns = ppo.critic_advantages(agent, rollout, config)
     rewards = (1 - gamma) * tape.rewards[:8]  # values are in units of the reward
@@ -171,18 +151,10 @@ def test_policy_loss__by_hand():
 # --- refusals -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "index", "value", "step"),
-    [
-        ("obs", (9, 5, 1), np.nan, 96),
-        ("rewards", (9, 5), -np.inf, 96),
-        ("last_obs", ..., np.nan, 48),
-    ],
-)
-def test_train__refuses_what_is_not_finite(name, index, value, step):
+def test_train__refuses_what_is_not_finite():
     tape = Tape()
-    getattr(tape, name)[index] = value
-    with pytest.raises(ValueError, match=f"^loss: expected finite numbers at step {step}, got "):
+    tape.last_obs[:] = np.nan
+    with pytest.raises(ValueError, match=r"^loss: expected finite numbers at step 48, got "):
         ppo.train(tape, SMALL, 0)
 
 
@@ -333,28 +305,6 @@ def test_train__is_the_algorithm_of_the_paper(target_kl, rates):
     assert (agent.return_mean.item(), agent.return_var.item() ** 0.5) == pytest.approx(
         scale_of(seen), rel=1e-4
     )
-
-
-def test_train__takes_other_advantages_without_a_critic():
-    """The actor follows them; the critic keeps its weights and its scale."""
-    logged = []
-
-    def rewards_as_advantages(agent, rollout, config):
-        return rollout.rewards, None
-
-    agent = ppo.train(
-        Tape(),
-        SMALL,
-        0,
-        rewards_as_advantages,
-        lambda now, rollout, metrics: logged.append(metrics),
-    )
-    fresh = ppo.begin(Tape(), SMALL, 0).agent
-    assert [metrics["losses/value_loss"] for metrics in logged] == [0.0, 0.0]
-    assert (agent.return_mean, agent.return_var) == (0, 1)
-    for part, equal in (("critic", True), ("actor", False)):
-        pairs = zip(getattr(agent, part).parameters(), getattr(fresh, part).parameters())
-        assert all(torch.equal(*pair) for pair in pairs) == equal
 
 
 def test_train__takes_a_last_minibatch_of_one_step():

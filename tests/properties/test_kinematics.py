@@ -83,19 +83,6 @@ def test_tool_velocity__is_the_derivative_along_the_motion(case):
     np.testing.assert_allclose(velocity, (ahead - behind) / (2 * STEP), atol=1e-7)
 
 
-@given(moving(shapes=[(1,), (4,), (2, 3)]))
-def test_a_batch__is_its_poses_one_by_one(case):
-    machine, q, q_dot = case
-    frames = forward_kinematics(machine, q)
-    for index in np.ndindex(q.shape[:-1]):
-        alone = forward_kinematics(machine, q[index])
-        np.testing.assert_allclose(tool_position(frames)[index], tool_position(alone), atol=1e-13)
-        np.testing.assert_allclose(lowest_point(frames)[index], lowest_point(alone), atol=1e-13)
-        np.testing.assert_allclose(jacobian(frames)[index], jacobian(alone), atol=1e-13)
-        velocity = tool_velocity(alone, q_dot[index])
-        np.testing.assert_allclose(tool_velocity(frames, q_dot)[index], velocity, atol=1e-13)
-
-
 @given(moving())
 def test_single_precision__stays_single_and_close(case):
     machine, q, q_dot = case
