@@ -52,17 +52,6 @@ def test_smooth_angles__by_hand():
     np.testing.assert_allclose(smooth_angles(machine, history), [expected], atol=1e-12)
 
 
-@given(machines(), st.integers(0, 1000))
-def test_smooth_angles__are_the_angles_of_steady_motion_and_of_constant_acceleration(machine, seed):
-    """Whatever the pose; velocities are late by half their window, as those of the estimator."""
-    q, q_dot, q_ddot = np.random.default_rng(seed).normal(size=(3, len(machine.driven), 1))
-    t = machine.dt * np.arange(1 - machine.history, 1)
-    late = t - machine.dt * (machine.velocity_samples - 1) / 2
-    angles = q + q_dot * t + q_ddot * t**2 / 2
-    history = np.stack([angles, q_dot + q_ddot * late, 0 * angles], axis=1)
-    np.testing.assert_allclose(smooth_angles(machine, history), angles[:, -1], atol=1e-9)
-
-
 @given(posed(shapes=[(5,)]), st.integers(0, 1000))
 def test_remember__has_the_velocity_that_the_tool_had_when_the_joints_had_theirs(case, seed):
     """Of joints in steady motion, by differences of the pose; noise of its own stays as it is."""

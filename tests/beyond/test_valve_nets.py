@@ -16,12 +16,6 @@ from brokk_min.machine import valve_opening
 ZONES = np.array([[0.07, 0.07], [0.2, 0.1], [0.0, 0.3]])
 
 
-def valve_net(velocity: float) -> ValveNet:
-    """Nets of four joints that say `velocity` whatever they read."""
-    net = constant_net([velocity] * 4, tuple("abcd"), rows=4)
-    return ValveNet(**vars(net), dead_zones=np.full((4, 2), 0.07))
-
-
 def test_mu_law__by_hand():
     """Openings 0.01 and 0.5: ln(1.5) and ln(26) of ln(51)."""
     expected = [-1, -np.log(1.5) / np.log(51), 0, np.log(26) / np.log(51), 1]
@@ -51,4 +45,6 @@ def test_predict__holds_a_joint_whose_valve_was_closed_and_that_stood_still(coun
     history[1, 2, 3] = -9 / 127
     history[2, 0, -1] = 0.503
     history[3, 0, -1] = 0.501
-    np.testing.assert_allclose(valve_net(0.2).predict(history), [0, 0.2, 0.2, 0], atol=1e-6)
+    net = constant_net([0.2] * 4, tuple("abcd"), rows=4)
+    found = ValveNet(**vars(net), dead_zones=np.full((4, 2), 0.07)).predict(history)
+    np.testing.assert_allclose(found, [0, 0.2, 0.2, 0], atol=1e-6)

@@ -14,32 +14,6 @@ DT = 0.05
 DRIVEN = np.array([joint.driven for joint in BROKK_170.joints])
 
 
-@pytest.mark.parametrize(
-    ("commands", "moved", "mrad"),
-    [
-        ([80] * 9, 0, 4.0),
-        ([-80] * 9, 0, 4.0),
-        ([80] * 4 + [30] + [80] * 4, 0, 1.0),
-        ([80] * 4 + [13] + [80] * 4, 0, 0.0),
-        ([80] * 4 + [-30] + [80] * 4, 0, 0.0),
-        ([80] * 9, -1, 4.0),
-        ([80] * 9, 2, 0.0),
-        ([0] * 9, 0, 0.0),
-    ],
-)
-def test_expected_motion__of_q1_by_hand(commands, moved, mrad):
-    """Its dead zone is 1.5 * 7 % = 13.3 counts of 127, fastest 0.20 rad/s."""
-    state = gate_start(BROKK_170)
-    state.sent[0] = commands
-    counts = np.array([moved, 0, 0, 0, 0])
-    place, motion = expected_motion(BROKK_170, state, counts)
-    assert motion[0] == pytest.approx(1e-3 * mrad, abs=1e-5)
-    assert place[0] == (0 if mrad else moved)
-    state.motion[0] = 0.001
-    _, again = expected_motion(BROKK_170, state, counts)
-    assert again[0] == pytest.approx(1e-3 * (mrad + 1) if mrad else 0.0, abs=1e-5)
-
-
 def test_expected_motion__counts_from_one_and_a_half_of_the_machines_widest_dead_zone():
     """Of 0.07 and 0.16 the second, one joint's downward: it holds for all of them, both ways."""
     joint = replace(BROKK_170.joints[4], dead_zone=(0.07, 0.16))

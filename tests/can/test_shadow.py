@@ -156,15 +156,6 @@ def test_shadow__sends_sync_and_starts_nodes_if_it_is_asked_to():
     assert len(world.drive.pairs) > 30 and world.drive.operator_input.v_goal == (0.0, 0.1, 0.0)
 
 
-def test_shadow__says_that_no_positions_came():
-    world, left = shadowed(controller=ConstantCommand(0, 0, 0, 10, 0))
-    world.upward = lambda can_id, data: [(can_id, data)] * (can_id >= 0x700)
-    world.run(1.0)
-    assert left == [] and not world.drive.pairs
-    assert world.drive.report().splitlines()[0].startswith("compared in 0 of ")
-    assert world.drive.faults["q1: silent"] > 10
-
-
 def test_drive_shadow__sends_nothing_until_it_gives_up(tmp_path, capsys, monkeypatch):
     """Not even SYNC and the start of the nodes, for which it waits here in vain."""
     monkeypatch.setattr("brokk_min.can.operator_input.PATIENCE", 0.5)

@@ -37,21 +37,7 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
         assert "means over 1 sequences from 1 starts" in printed
         assert f"{'strongest PID':26}{'closed':>15}{errors[plant][-1]:15.4g}" in printed
     assert len({row[1] for row in errors.values()}) == 3
-
-
-@pytest.mark.parametrize(
-    ("options", "status", "message"),
-    [
-        ("--json {0}/gains.json", 2, "gains.json: expected no file (or --force), got one"),
-        ("--policy {0}/gains.json", 1, "gains.json: expected a readable .npz file of a policy"),
-        ("--starts {0}/c.csv", 1, "c.csv: expected columns ['q1', 'q2', 'q3', 'q4', 'q5'], got"),
-        ("--commands {0}/s.csv", 1, "s.csv: expected columns ['sequence', 'time', 'vx', 'vy',"),
-    ],
-)
-def test_evaluate__refuses(folder, capsys, options, status, message):
-    assert evaluate(folder, options.format(folder)) == status
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("brokk-min: ") and message in error
+    assert evaluate(folder, f"--json {out}") == 2  # it is there
 
 
 def test_evaluate__tunes_pids_anew_and_again_by_what_the_file_says(folder, capsys, monkeypatch):

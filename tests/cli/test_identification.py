@@ -135,27 +135,3 @@ def test_inspect__reads_recordings_of_ros(tmp_path, capsys):
     assert "1 recordings" in printed and 'Joint("arm", q_min=-0.380, q_max=-0.040' in printed
     assert run(f"inspect {topics} --map arm=q_arm:-1", bag) == 0
     assert 'Joint("arm", q_min=0.040, q_max=0.380' in capsys.readouterr().out
-
-
-def test_fit__keeps_the_range_of_the_nets_when_an_angle_was_not_read(tmp_path, capsys):
-    """And refuses a log in which the sign changes between recordings, with their names."""
-    log = foreign_log(tmp_path / "log.csv", 0, 4)
-    rows = log.read_text().splitlines()
-    cells = rows[5000].split(",")
-    rows[5000] = ",".join([*cells[:-1], "0.0"])
-    (tmp_path / "one.csv").write_text("\n".join(rows) + "\n")
-    outputs = []
-    for name in ("log", "one"):
-        out = tmp_path / f"{name}.npz"
-        assert run(f"fit {TINY}", tmp_path / f"{name}.csv", "--out", out) == 0
-        outputs.append(load_net(out).output_high)
-    np.testing.assert_allclose(outputs[1], outputs[0], rtol=0.02)
-    assert "one.csv: row 5001: expected q_arm at" in capsys.readouterr().out
-    rows = [
-        ",".join([*cells[:-1], str(-float(cells[-1]))]) if cells[0] == "take 2" else ",".join(cells)
-        for cells in (line.split(",") for line in log.read_text().splitlines())
-    ]
-    (tmp_path / "some.csv").write_text("\n".join(rows) + "\n")
-    assert run(f"fit --force {TINY}", tmp_path / "some.csv", "--out", out) == 1
-    refusal = "u_arm: expected one sign in all recordings, got the other sign in ['take 2']"
-    assert refusal in capsys.readouterr().err

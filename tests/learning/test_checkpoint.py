@@ -12,7 +12,7 @@ from helpers_machines import obedient_net, small_net
 from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.env import PAPER, TaskConfig
-from brokk_min.learning.checkpoint import prepare, stagger_episodes, train_policy
+from brokk_min.learning.checkpoint import prepare, train_policy
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
 from brokk_min.learning.recipes import find_recipe
@@ -72,6 +72,7 @@ def test_prepare__begins_what_the_recipe_says(paper, critic):
     kind = torch.optim.Adam if paper or critic else torch.optim.Muon
     assert isinstance(start.optimizer, kind)
     assert len(np.unique(env.state.ticks)) > 100
+    assert not env.state.ticks[env.state.lowest < 0].any()
     assert start.obs.shape == (256, len(env.interface.scale(BROKK_170)[0]))
 
 
@@ -116,12 +117,3 @@ def test_checkpoint__executes_nothing(tmp_path):
     with pytest.raises(ValueError, match="expected a readable checkpoint"):
         run(path)
     assert not (tmp_path / "created").exists()
-
-
-def test_stagger_episodes__ends_some_in_every_batch():
-    env = TaskVectorEnv(100, NET, BROKK_170, TaskConfig(episode_s=10.0))
-    env.reset(seed=0)
-    buried = env.state.lowest < 0
-    stagger_episodes(env)
-    ticks = np.arange(100) * 2
-    assert env.state.ticks.tolist() == np.where(buried, 0, ticks).tolist()

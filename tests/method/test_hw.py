@@ -230,22 +230,13 @@ def test_tick__starts_nodes_that_fell_back_once_the_switch_is_released(world):
 # --- the clock -----------------------------------------------------------------------------------
 
 
-def busy(world, seconds):
-    """Sending a valve frame takes some time."""
-
-    def send(can_id, data):
-        world.sleep(seconds * (can_id == 0x210))
-        return [(can_id, data)]
-
-    return send
-
-
 def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world):
     world.controller.m = np.zeros(5)
     world.step = 0.0007  # does not divide a tick
     begun = world.time
     for k in range(120):
-        world.downward = busy(world, {40: 0.13, 80: 0.052, 90: 0.26}.get(k, 0.004))
+        stall = {40: 0.13, 80: 0.052, 90: 0.26}.get(k, 0.004)  # sending takes some time
+        world.downward = only(0x210, lambda data, stall=stall: world.sleep(stall) or [data])
         world.drive.tick()
     ticks = (np.array(world.syncs[1:]) - begun) / 0.05  # without that of the start
     late = np.flatnonzero(ticks - np.floor(ticks + 0.03) > 0.03)
