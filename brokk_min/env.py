@@ -27,9 +27,9 @@ An `Interface` is what an agent reads, does and is paid for. The defaults are th
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,8 +63,8 @@ def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
 
 
 @lru_cache
-def observation_table(machine: Machine) -> Array:
-    """Mean, deviation, and whether sensors measure it (0 or 1), of each number observed: (obs, 3).
+def observation_table(machine: Machine) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Mean and deviation, float32, of each number observed, and do sensors measure it? (obs,) each.
 
     Angles are uniform over their range. Paper: Sec. 3.4 (normalisation)
     """
@@ -77,21 +77,8 @@ def observation_table(machine: Machine) -> Array:
     for j in machine.driven:
         rows += [(q_mean[j], q_std[j], 1.0)] * H + [(0.0, q_dot_std[j], 1.0)] * H
     rows += [(0.0, COMMAND_STD * machine.pwm_limit / PWM_MAX, 0.0)] * H * len(machine.driven)
-    return np.array(rows)
-
-
-@lru_cache
-def observation_scale(machine: Machine) -> tuple[Array, Array]:
-    """Mean and deviation of the observation, float32 (obs,) both."""
-    mean, std, _ = observation_table(machine).T.astype(np.float32)
-    return mean, std
-
-
-@lru_cache
-def sensor_std(machine: Machine) -> Array:
-    """Deviations of what sensors measure, the unit of its noise, float32 (noisy numbers,)."""
-    _, std, noisy = observation_table(machine).T
-    return np.asarray(std[noisy == 1], np.float32)
+    mean, std, noisy = np.array(rows, np.float32).T
+    return mean, std, noisy == 1
 
 
 def measure(
@@ -106,7 +93,8 @@ def measure(
     """
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
-    error = np.asarray(noise * sensor_std(machine))
+    _, std, noisy = observation_table(machine)
+    error = np.asarray(noise * std[noisy])
     v_error, q_error, history_error = np.split(error, [3, 3 + len(machine.locked)], axis=-1)
     q[..., machine.locked] += q_error
     driven[..., :2, :] += history_error.reshape(*error.shape[:-1], -1, 2, machine.history)
@@ -122,7 +110,7 @@ def features(machine: Machine, measured: Measured) -> Array:
     u = measured.history[..., 2, :].reshape(shape)
     q_locked = measured.q[..., machine.locked]
     numbers = [measured.v_goal, measured.v_tool, q_locked, angles_and_velocities, u]
-    mean, std = observation_scale(machine)
+    mean, std, _ = observation_table(machine)
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / std
 
 
@@ -154,7 +142,9 @@ class Interface:
     The fields are functions, not methods.
     """
 
-    scale: Callable[[Machine], tuple[Array, Array]] = observation_scale  # mean, deviation
+    scale: Callable[[Machine], tuple[Array, Array]] = (  # mean, deviation
+        lambda machine: observation_table(machine)[:2]
+    )
     remember: Callable[[Machine, Any, Measured], Any] = lambda machine, memory, measured: None
     observe: Callable[[Machine, Measured, Any], Array] = lambda machine, measured, memory: features(
         machine, measured
@@ -170,9 +160,8 @@ class Interface:
 PAPER = Interface()
 
 
-@dataclass(frozen=True)
-class State:
-    """One or many machines at work; arrays (..., n) unless noted. Changed with `replace` only."""
+class State(NamedTuple):
+    """One or many machines at work; arrays (..., n) unless noted."""
 
     plant: Any  # state of what moves the machine
     q: Array  # true angle [rad]
@@ -210,8 +199,7 @@ def transition(machine: Machine, plant: Plant, state: State, u: Array) -> State:
     q_dot = (q - state.q) / machine.dt
     frames = forward_kinematics(machine, q.astype(np.float32))
     window = machine.velocity_samples, machine.dt
-    return replace(
-        state,
+    return state._replace(
         plant=after,
         q=q,
         q_dot=q_dot,

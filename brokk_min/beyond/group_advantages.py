@@ -24,7 +24,6 @@ GRPO (Shao et al., 2024) that of the group.
 It plugs into `ppo.train` as its advantage function.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -72,7 +71,7 @@ class GroupVectorEnv(TaskVectorEnv):
     def new_goals(self, state: State) -> State:
         """New goals for groups; their machines change goals at the same ticks."""
         first = super().new_goals(map_arrays(lambda rows: rows[::COPIES], state))
-        return replace(state, v_goal=repeat(first.v_goal), goal_ticks=repeat(first.goal_ticks))
+        return state._replace(v_goal=repeat(first.v_goal), goal_ticks=repeat(first.goal_ticks))
 
     def step_without_reset(self, actions: Array) -> Step:
         """The episode of a group ends where that of one of its machines does."""

@@ -135,7 +135,7 @@ def observation_scale(machine: Machine) -> tuple[Array, Array]:
     commands the newest samples. The samples of a signal weigh as one number, sum w^2 = 1.
     """
     n, H, first = len(machine.driven), machine.history, 6 + len(machine.locked)
-    mean, std = env.observation_scale(machine)
+    mean, std, _ = env.observation_table(machine)
     angles = slice(first, first + 2 * n * H, 2 * H)  # one of each joint
     q_dot_std, u_std = env.velocity_deviations(machine)[1][machine.driven], std[-1]
     fading = np.exp(-np.arange(H // 2)[::-1] / (FADE * H))

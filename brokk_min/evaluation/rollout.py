@@ -1,6 +1,5 @@
 """A controller follows given tool velocities, on the analytic plant or on any other one."""
 
-from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -72,7 +71,7 @@ def rollout(
         error = draw_noise(machine, noise, len(state.q), rng)
         measured = measure(machine, state.history, v_goal, error)
         u, controller_state = controller(measured, controller_state)
-        state = transition(machine, plant, replace(state, v_goal=v_goal), u)
+        state = transition(machine, plant, state._replace(v_goal=v_goal), u)
         frames = forward_kinematics(machine, state.q)
         v_tool, p_tool = tool_velocity(frames, state.q_dot), tool_position(frames)
         rewards = reward(goal, v_tool)

@@ -2,7 +2,7 @@
 
 import io
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +88,7 @@ def stagger_episodes(env: TaskVectorEnv) -> None:
     episode_ticks = round(env.config.episode_s * env.machine.rate)
     ticks = np.arange(env.num_envs) * episode_ticks // env.num_envs
     low = env.state.lowest < env.machine.ground  # these end in their first tick, as always
-    env.state = replace(env.state, ticks=np.where(low, 0, ticks))
+    env.state = env.state._replace(ticks=np.where(low, 0, ticks))
 
 
 class TrainingLog:

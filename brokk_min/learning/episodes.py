@@ -1,14 +1,13 @@
 """Episodes of training: random starts and goals, noisy observations. Paper: Sec. 3.4"""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brokk_min.actuator import PLANT, Plant
-from brokk_min.env import State, initial_state, sensor_std
+from brokk_min.env import State, initial_state, observation_table
 from brokk_min.machine import Array, Machine
 from brokk_min.settings import TaskConfig
 
@@ -46,7 +45,7 @@ def reset(
     pose = draw_pose(machine, rng, num)
     goal = draw_goal(machine, config, rng, num)
     state = initial_state(machine, pose, goal, plant)
-    return replace(state, goal_ticks=draw_hold(machine, config, rng, num))
+    return state._replace(goal_ticks=draw_hold(machine, config, rng, num))
 
 
 def new_goals(
@@ -59,12 +58,13 @@ def new_goals(
     v_goal, goal_ticks = state.v_goal.copy(), state.goal_ticks.copy()
     v_goal[rows] = draw_goal(machine, config, rng, len(rows))
     goal_ticks[rows] = draw_hold(machine, config, rng, len(rows))
-    return replace(state, v_goal=v_goal, goal_ticks=goal_ticks)
+    return state._replace(v_goal=v_goal, goal_ticks=goal_ticks)
 
 
 def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Generator) -> Array:
     """Uniform noise of `env.measure`, up to +- `largest` deviations, float32 (num, noisy)."""
-    noise = 2 * rng.random((num, len(sensor_std(machine))), np.float32) - 1
+    noisy = observation_table(machine)[2].sum()
+    noise = 2 * rng.random((num, noisy), np.float32) - 1
     return np.float32(largest) * noise
 
 
@@ -72,9 +72,6 @@ def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
     """`function` of all arrays in a `State`, a memory or a plant's state: tuples of arrays."""
     if first is None:
         return None
-    if isinstance(first, State):
-        parts = (tuple(vars(one).values()) for one in (first, *others))
-        return State(*map_arrays(function, *parts))
     if isinstance(first, tuple):
         values = [map_arrays(function, *row) for row in zip(first, *others, strict=True)]
         return first._make(values) if hasattr(first, "_make") else tuple(values)

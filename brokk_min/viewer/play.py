@@ -9,7 +9,7 @@ import os
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -101,7 +101,7 @@ class Session:
 
     def tick(self, v_goal: Array) -> None:
         """Controller and plant go on by a tick, with this goal velocity [m/s] (3,)."""
-        self.state = replace(self.state, v_goal=v_goal.astype(np.float32)[None])
+        self.state = self.state._replace(v_goal=v_goal.astype(np.float32)[None])
         measured = measure(self.machine, self.state.history, self.state.v_goal)
         u, self.memory = self.controllers[self.names[0]](measured, self.memory)
         self.state = transition(self.machine, self.plant, self.state, u)

@@ -80,7 +80,7 @@ def test_observe__by_hand():
     obs = observe(BROKK_170, measured, memory(0, integral))
     assert obs.shape == (91,) and obs.dtype == np.float32
     paper = env.features(BROKK_170, measured)
-    paper[3:6] = np.array(V_TOOL) / env.observation_scale(BROKK_170)[1][3:6]
+    paper[3:6] = np.array(V_TOOL) / env.observation_table(BROKK_170)[1][3:6]
     np.testing.assert_allclose(obs[:7], 0.75 * paper[:7], rtol=1e-5)
     q = measured.q.astype(float)
     q[DRIVEN] = smooth_angles(BROKK_170, measured.history)
@@ -108,7 +108,7 @@ def test_the_table_of_the_docstring__is_true():
     """Numbers and weights of the table are those of the scale; of samples, of the newest."""
     rows = re.findall(r"^\| (\d+)-(\d+) +\| .+? +\| .+? +\| ([\d.]+)", interface.__doc__, re.M)
     _, scale = observation_scale(BROKK_170)
-    std = env.observation_scale(BROKK_170)[1]
+    std = env.observation_table(BROKK_170)[1]
     q_dot = env.velocity_deviations(BROKK_170)[1][DRIVEN]
     samples = [np.repeat(q_dot, 6), std[-24:], np.full(24, 0.5)]
     deviations = np.concatenate([std[:7], std[7:111:26], *samples, q_dot, 0.1 * q_dot])
@@ -128,7 +128,7 @@ def test_scale__of_any_machine_lets_the_samples_of_a_signal_weigh_as_one_number(
     mean, scale = observation_scale(machine)
     assert mean.shape == scale.shape == (first + n + 3 * n * half + 2 * n,)
     q_dot = env.velocity_deviations(machine)[1][machine.driven]
-    u = env.observation_scale(machine)[1][-1]
+    u = env.observation_table(machine)[1][-1]
     std = np.repeat([*q_dot, *np.full(n, u), *np.full(n, 0.5)], half)
     weights = (std / scale[first + n : -2 * n]).reshape(3 * n, half)
     np.testing.assert_allclose((weights**2).sum(axis=1), 1, rtol=1e-4)

@@ -1,14 +1,12 @@
 """Episodes: distributions of poses and goals, goals that change, rows that are replaced."""
 
-from dataclasses import fields, replace
-
 import numpy as np
 import pytest
 from helpers_machines import closed_form
 from scipy import stats
 
 from brokk_min.actuator import PlantState
-from brokk_min.env import State, TaskConfig, sensor_std
+from brokk_min.env import TaskConfig, observation_table
 from brokk_min.learning import episodes
 from brokk_min.machine import BROKK_170
 
@@ -53,7 +51,7 @@ def test_draw_hold__is_whole_ticks_and_at_least_one(seconds, ticks):
 
 def test_new_goals__change_where_their_time_is_over():
     state = episodes.reset(BROKK_170, TaskConfig(), generator(), 3)
-    state = replace(state, v_goal=np.abs(state.v_goal) + 0.01, goal_ticks=np.array([1, 0, 2]))
+    state = state._replace(v_goal=np.abs(state.v_goal) + 0.01, goal_ticks=np.array([1, 0, 2]))
     after = episodes.new_goals(BROKK_170, TaskConfig(), state, generator())
     assert (after.v_goal != state.v_goal).any(axis=1).tolist() == [False, True, False]
     assert after.goal_ticks[[0, 2]].tolist() == [1, 2]
@@ -64,8 +62,7 @@ def test_replace_rows__replaces_whole_rows_and_nothing_else():
     old = episodes.reset(BROKK_170, TaskConfig(), generator(1), 5)
     new = episodes.reset(BROKK_170, TaskConfig(), generator(2), 2)
     state = episodes.replace_rows(old, np.array([4, 1]), new)
-    for field in fields(State):
-        values = [getattr(one, field.name) for one in (old, new, state)]
+    for values in zip(old, new, state, strict=True):
         pairs = zip(*values) if isinstance(values[0], PlantState) else [values]
         for before, fresh, after in pairs:
             assert np.array_equal(after[[0, 2, 3]], before[[0, 2, 3]])
@@ -76,6 +73,6 @@ def test_replace_rows__replaces_whole_rows_and_nothing_else():
 
 def test_draw_noise__is_uniform_up_to_the_largest():
     noise = episodes.draw_noise(BROKK_170, 0.05, 400, generator())
-    assert noise.dtype == np.float32 and noise.shape == (400, len(sensor_std(BROKK_170)))
+    assert noise.dtype == np.float32 and noise.shape == (400, observation_table(BROKK_170)[2].sum())
     assert np.abs(noise).max() <= 0.05
     assert stats.kstest(noise[:, 7] / 0.1 + 0.5, "uniform").pvalue > 1e-3

@@ -30,7 +30,7 @@ def test_step__resets_only_the_rows_that_ended_and_gives_their_last_observation(
     long = TaskVectorEnv(4, plant, LOW, TaskConfig(episode_s=9.0), interface)
     obs, _ = short.reset(seed=5)
     twin_obs, _ = long.reset(seed=5)
-    short.state = replace(short.state, ticks=np.array([3, 0, 3, 0]))
+    short.state = short.state._replace(ticks=np.array([3, 0, 3, 0]))
     rng = np.random.default_rng(18)
     for tick in range(1, 18):
         assert np.array_equal(obs, twin_obs)
@@ -89,7 +89,7 @@ def test_next_step__ended_episodes_begin_in_the_step_after_theirs():
     mode = AutoresetMode.NEXT_STEP
     env = TaskVectorEnv(3, NET, LOW, SHORT, autoreset_mode=mode, max_episode_steps=6)
     env.reset(seed=0)
-    env.state = replace(env.state, ticks=np.array([4, 0, 0]))
+    env.state = env.state._replace(ticks=np.array([4, 0, 0]))
     seen = [env.step(np.ones((3, 4))) for _ in range(4)]
     assert [ends.tolist() for *_, ends, _ in seen] == [[i == 1, False, False] for i in range(4)]
     assert [rewards[0] > 0 for _, rewards, *_ in seen] == [True, True, False, True]

@@ -75,10 +75,10 @@ def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message)
     save_policy(tmp_path / "p.npz", policy("paper"))
     name = {"name": f"m {change}"} if "tool_speed" in change else {}  # caches go by the name
     machine = replace(BROKK_170, q_start=(), **change, **dict.fromkeys(name, "brokk170"))
-    env.observation_scale.cache_clear()
+    env.observation_table.cache_clear()
     with pytest.raises(ValueError, match=message):
         load_policy(tmp_path / "p.npz", machine)
-    env.observation_scale.cache_clear()
+    env.observation_table.cache_clear()
 
 
 @pytest.mark.parametrize("file", POLICIES.values())

@@ -17,9 +17,7 @@ from brokk_min.env import (
     features,
     initial_state,
     measure,
-    observation_scale,
     observation_table,
-    sensor_std,
     transition,
     velocity_deviations,
 )
@@ -102,9 +100,8 @@ def test_measure__is_in_physical_units_of_the_base_frame(machine, seed):
     np.testing.assert_allclose(measured.v_tool, (ahead - behind) / 2e-6, atol=1e-7)
     size = 6 + len(machine.locked) + 3 * machine.history * len(machine.driven)
     assert features(machine, measured).shape == (4, size)
-    assert len(observation_table(machine)) == size
-    mean, std = observation_scale(machine)
-    assert mean.shape == std.shape == (size,) and (std > 0).all()
+    mean, std, noisy = observation_table(machine)
+    assert mean.shape == std.shape == noisy.shape == (size,) and (std > 0).all()
 
 
 def test_velocity_deviations__are_those_of_the_task():
@@ -131,7 +128,7 @@ def test_velocity_deviations__are_those_of_the_task():
 
 def test_measure__adds_noise_to_what_sensors_measure_in_deviations():
     """Each number of each machine has its own; commands have none."""
-    history, size = np.stack([numbered_history()] * 2), len(sensor_std(BROKK_170))
+    history, size = np.stack([numbered_history()] * 2), observation_table(BROKK_170)[2].sum()
     assert size == 3 + 1 + 4 * 2 * 13
     kept, goals = history.copy(), np.zeros((2, 3), np.float32)
     noise = np.random.default_rng(0).uniform(-0.1, 0.1, (2, size)).astype(np.float32)
@@ -152,18 +149,15 @@ def test_the_table_of_the_docstring__is_true():
         r"^\| (\d+)(?:-(\d+))? +\| .+? +\| (.+?) +\| (\w+) +\|", task.__doc__ or "", re.M
     )
     assert len(rows) == 5
-    table, place = observation_table(BROKK_170), 0
+    (_, std, noisy), place = observation_table(BROKK_170), 0
     for first, last, deviation, noise in rows:
         assert int(first) == place
         place = int(last or first) + 1
-        _, std, noisy = table[int(first) : place].T
-        assert set(noisy) == {float(noise == "yes")}
+        assert set(noisy[int(first) : place]) == {noise == "yes"}
         number = re.match(r"0\.\d{3}", deviation)
-        assert not number or std == pytest.approx(float(number[0]), abs=5e-4)
+        assert not number or std[int(first) : place] == pytest.approx(float(number[0]), abs=5e-4)
     assert (
-        place == len(table) == 163
-        and "(163,)" in task.__doc__
-        and "Box(-1, 1, (4,))" in task.__doc__
+        place == len(std) == 163 and "(163,)" in task.__doc__ and "Box(-1, 1, (4,))" in task.__doc__
     )
     assert TaskConfig().episode_s == 20 and "20 s" in task.__doc__
 

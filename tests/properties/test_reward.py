@@ -54,8 +54,8 @@ def test_step__pays_eq2_of_the_true_velocity_and_nothing_in_the_ground(case):
     """The velocity is that of differences of the pose over the tick, whatever the encoders say."""
     machine, q, goals, u = case
     state = initial_state(machine, q, goals)
-    state = replace(state, plant=state.plant._replace(v=np.ones_like(q)))  # in full motion
-    for given_array in (*vars(state).values(), *state.plant, u):
+    state = state._replace(plant=state.plant._replace(v=np.ones_like(q)))  # in full motion
+    for given_array in (*state, *state.plant, u):
         if isinstance(given_array, np.ndarray):
             given_array.setflags(write=False)  # a write in place would raise
     after, r, end, truncated = step(machine, TaskConfig(noise=0.0), PLANT, state, u)
@@ -84,7 +84,7 @@ def test_step__ends_a_start_in_the_ground_and_truncates_at_the_time_limit(case):
     state = initial_state(machine, q, goals)
     for before, limit in ((0, 1), (0, second), (1, second), (second - 1, second), (second, second)):
         config = TaskConfig(episode_s=limit / machine.rate)
-        now = replace(state, ticks=np.full(3, before))
+        now = state._replace(ticks=np.full(3, before))
         after, r, end, truncated = step(machine, config, PLANT, now, u)
         ground = forward_kinematics(machine, after.q).p[:, 1:, 2].min(axis=-1) - machine.ground
         sure = np.abs(ground) > 1e-5  # single precision
