@@ -1,15 +1,16 @@
-"""Nets that read what commands open: their inputs by hand, by torch, and joints that are held."""
+"""Nets that read what commands open, joints that are held, and means of several nets."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from helpers_machines import constant_net
+from helpers_machines import constant_net, random_net
 from hypothesis import given
 from hypothesis import strategies as st
 
 from brokk_min.actuator import initial_history
+from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet, mu_law, opening, valve_inputs
 from brokk_min.machine import valve_opening
 
@@ -48,3 +49,16 @@ def test_predict__holds_a_joint_whose_valve_was_closed_and_that_stood_still(coun
     net = constant_net([0.2] * 4, tuple("abcd"), rows=4)
     found = ValveNet(**vars(net), dead_zones=np.full((4, 2), 0.07)).predict(history)
     np.testing.assert_allclose(found, [0, 0.2, 0.2, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(), (7,), (2, 3)])
+def test_predict__is_the_mean_of_the_nets(shape):
+    common = vars(random_net(rows=4)) | {"dead_zones": ZONES}
+    drawn = [random_net(np.random.default_rng(seed), rows=4).weights for seed in range(3)]
+    stacked = tuple(np.stack(of, axis=1) for of in zip(*drawn, strict=True))
+    history = np.random.default_rng(3).uniform(-1, 1, (*shape, 3, 3, 13)).astype(np.float32)
+    each = np.array([ValveNet(**common | {"weights": w}).predict(history) for w in drawn])
+    assert each.std(axis=0).min() > 1e-4  # they do not agree
+    found = NetEnsemble(**common | {"weights": stacked}).predict(history)
+    assert found.shape == (*shape, 3) and found.dtype == np.float32
+    np.testing.assert_allclose(found, each.mean(axis=0), atol=1e-6)

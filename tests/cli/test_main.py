@@ -103,16 +103,13 @@ VIRTUAL = "drive --interface virtual --channel v"
         (f"{TRAIN} --episode-s nan", 2, "--episode-s: expected a positive number, got nan"),
         (f"{TRAIN} --gamma 1.0", 2, "--gamma: expected below 1, got 1.0"),
         (f"{TRAIN} --hold-max-s 0.4", 2, "--hold-max-s: expected 0.5 or more, got 0.4"),
-        ("sweep --actuator missing.npz --out s", 1, "missing.npz: no such file or directory"),
         ("sweep --actuator missing.npz --out s --seeds 0", 2, "--seeds: expected 1 or more, got 0"),
-        ("evaluate --policy missing.npz", 1, "missing.npz: no such file or directory"),
         ("evaluate --num-starts 0", 2, "--num-starts: expected 1 or more, got 0"),
         ("machine --interface nonsense --channel 0", 1, "nonsense 0: expected a CAN bus, got"),
         (f"{VIRTUAL} --controller jog --joint q2", 2, "--joint: expected one of ['q1', 'q3',"),
         (f"{VIRTUAL} --controller jog --joint q1", 1, "joystick: expected one, or --command FILE"),
         (f"{VIRTUAL} --sync", 2, "--sync: expected --shadow with it, got a drive that sends SYNC"),
         ("replay run.log --out a.mp4", 2, "--out: expected a name in .gif, got a.mp4"),
-        ("export --policy missing.npz --out p.onnx", 1, "missing.npz: no such file or directory"),
     ],
 )
 def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):
@@ -121,9 +118,3 @@ def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_pa
     refusal = capsys.readouterr().err.splitlines()[-1]
     assert refusal.startswith("brokk-min: ") and message in refusal
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("line", ["collect", "collect --out x.csv --hours a", "train --hurs 3"])
-def test_wrong_options__are_explained_and_leave_with_status_2(line, capsys):
-    assert run(line) == 2
-    assert "Traceback" not in capsys.readouterr().err

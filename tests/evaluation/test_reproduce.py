@@ -59,15 +59,8 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
     )
     out = tmp_path / "results"
     assert run(f"reproduce --quick --machine '{tmp_path}/m.py:COARSE' --seed 3 --out", out) == 0
-    for name in (
-        "log.npz",
-        "net.npz",
-        "policy.npz",
-        "gains.json",
-        "starts.csv",
-        "results.json",
-        "table.json",
-    ):
+    names = "log.npz net.npz policy.npz gains.json starts.csv results.json table.json"
+    for name in names.split():
         assert (folder / name).read_bytes() == (out / name).read_bytes(), name
     assert capsys.readouterr().out.endswith(f"{out / 'results.json'}\n")
 
@@ -76,11 +69,8 @@ def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
     log = read_log(folder / "log.npz", COARSE)
     assert log.joints == load_net(folder / "net.npz").joints == BROKK_170.names
     policies = {name: load_policy(folder / file, COARSE) for name, file in POLICIES.items()}
-    assert {name: policy.interface for name, policy in policies.items()} == {
-        "rl": "beyond",
-        "rl_paper": "paper",
-        "rl_critic": "paper",
-    }
+    interfaces = {"rl": "beyond", "rl_paper": "paper", "rl_critic": "paper"}
+    assert {name: policy.interface for name, policy in policies.items()} == interfaces
     learned_on = {name: fingerprint(policy.net) for name, policy in policies.items()}
     ours, printed = (load_net(folder / f"{name}.npz", COARSE) for name in ("net", "net_paper"))
     assert learned_on["rl"] == learned_on["rl_paper"] == fingerprint(ours)
