@@ -166,10 +166,12 @@ def compare(**variants: Figures) -> Figures:
 
 
 def d5() -> Figures:
-    """Policies trained with a cost of valve travel and without."""
-    with mock.patch.object(interface, "TRAVEL_COST", 0.0):
-        no_cost = train(STEPS)
-    return compare(ours=default_training(), no_cost=no_cost)
+    """Policies trained with costs of valve travel and of large commands, and without either."""
+    without = {}
+    for name in ("TRAVEL_COST", "EFFORT_COST"):
+        with mock.patch.object(interface, name, 0.0):
+            without[f"no {name}"] = train(STEPS)
+    return compare(ours=default_training(), **without)
 
 
 def d7() -> Figures:

@@ -35,7 +35,7 @@ STEPS = {
     "nets": "rich excitation, multi-step fit, five nets a joint that read what a command opens",
     "observation": "half of the history, error integral, resolved rates, open valves",
     "command": "actions from the dead zone on, closed valves at rest",
-    "cost": "costs of valve travel and error integral",
+    "cost": "costs of large commands, valve travel and error integral",
     "settings": "our settings of task and learner, and Muon",
 }
 RUNGS = {"the paper's agent": frozenset[str]()}
