@@ -166,7 +166,7 @@ def compare(**variants: Figures) -> Figures:
 
 
 def d5() -> Figures:
-    """Policies trained with costs of valve travel and of large commands, and without either."""
+    """Policies trained with the costs of valve travel and of large commands, and without one."""
     without = {}
     for name in ("TRAVEL_COST", "EFFORT_COST"):
         with mock.patch.object(interface, name, 0.0):

@@ -64,7 +64,7 @@ def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
 
 @lru_cache
 def observation_table(machine: Machine) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Mean and deviation, float32, of each number observed, and do sensors measure it? (obs,) each.
+    """Of each number observed its mean, deviation, and whether sensors measure it, (obs,) each.
 
     Angles are uniform over their range. Paper: Sec. 3.4 (normalisation)
     """

@@ -192,8 +192,8 @@ def command(machine: Machine, action: Array, memory: Memory) -> Array:
 def cost(machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
     """0.03 mean (u / limit)^2 + 0.1 mean |u - u_before| / limit + 1.5 |integral| [m], (...).
 
-    Four driven joints move the tool along three axes, so some of their motions cancel at the tool.
-    The first term keeps the policy from such motions, which in the end reach a stop.
+    Some motions of more than three joints cancel at the tool. The first term keeps the policy from
+    them, because in the end they push a joint against its stop.
     """
     limit = machine.pwm_limit / PWM_MAX
     effort = np.square(u[..., machine.driven] / limit).mean(axis=-1)

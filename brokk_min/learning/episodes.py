@@ -63,8 +63,8 @@ def new_goals(
 
 def draw_noise(machine: Machine, largest: float, num: int, rng: np.random.Generator) -> Array:
     """Uniform noise of `env.measure`, up to +- `largest` deviations, float32 (num, noisy)."""
-    noisy = observation_table(machine)[2].sum()
-    noise = 2 * rng.random((num, noisy), np.float32) - 1
+    size = observation_table(machine)[2].sum()  # what sensors measure
+    noise = 2 * rng.random((num, size), np.float32) - 1
     return np.float32(largest) * noise
 
 

@@ -118,3 +118,9 @@ def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_pa
     refusal = capsys.readouterr().err.splitlines()[-1]
     assert refusal.startswith("brokk-min: ") and message in refusal
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("line", ["collect", "collect --out x.csv --hours a", "train --hurs 3"])
+def test_wrong_options__are_explained_and_leave_with_status_2(line, capsys):
+    assert run(line) == 2
+    assert "Traceback" not in capsys.readouterr().err

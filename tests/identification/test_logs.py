@@ -80,8 +80,13 @@ def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed, start
     path = write(tmp_path_factory.getbasetemp() / "looped.npz", columns)
     (recording,) = read_log(path, BROKK_170).recordings
     grid = start + np.arange(int((time[-1] - start) * 20) + 1) / 20
-    u = [columns["u_a"][time <= now + 1e-9][-1] for now in grid]
-    q = np.interp(grid, time, columns["q_a"])
+    u, q = [], []
+    for now in grid:
+        last = np.flatnonzero(time <= now + 1e-9)[-1]
+        following = min(last + 1, len(time) - 1)
+        fraction = (now - time[last]) / ((time[following] - time[last]) or 1.0)
+        u.append(columns["u_a"][last])
+        q.append(columns["q_a"][last] + fraction * np.diff(columns["q_a"][[last, following]])[0])
     np.testing.assert_array_equal(recording.u[:, 0], u)
     tolerance = 1e-5 if start > 1e9 else 1e-9
     np.testing.assert_allclose(recording.q[:, 0], q, atol=tolerance)
@@ -276,6 +281,7 @@ def test_join_recordings__marks_recordings_in_which_a_joint_is_driven():
     samples = join_recordings(Log(("a", "b", "c"), recordings))
     assert samples.moves.tolist() == [[True, False, True]] * 6 + [[False, False, True]] * 6
     assert [w.tolist() for w in samples.windows(3, 2)] == [[2, 3], [], [2, 3, 8, 9]]
+    assert samples.starts(1, 2, 2).tolist() == [1, 3, 7, 9]
     np.testing.assert_allclose(samples.target[:5, 0], 2.0)  # 0.1 rad in 0.05 s
 
 

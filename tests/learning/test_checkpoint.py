@@ -71,7 +71,7 @@ def test_prepare__begins_what_the_recipe_says(paper, critic):
     assert recipe.learner.gae_lambda == (0.95 if critic else 1.0)
     kind = torch.optim.Adam if paper or critic else torch.optim.Muon
     assert isinstance(start.optimizer, kind)
-    assert len(np.unique(env.state.ticks)) > 100
+    assert len(np.unique(env.state.ticks)) > 100 and env.state.ticks.max() > 0.95 * 400
     assert not env.state.ticks[env.state.lowest < 0].any()
     assert start.obs.shape == (256, len(env.interface.scale(BROKK_170)[0]))
 

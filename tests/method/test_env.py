@@ -172,6 +172,7 @@ def test_transition__on_a_plant_of_ones_own_by_hand():
     assert state.lowest == pytest.approx(
         lowest_point(forward_kinematics(BROKK_170, POSE)), abs=1e-5
     )
+    assert initial_state(BROKK_170, [1] * 5, ZERO).q.dtype == float and state.goal_ticks > 1e9
     after = transition(BROKK_170, Obedient(), state, u)
     np.testing.assert_allclose(after.q, POSE + 0.05 * u, atol=1e-12)
     np.testing.assert_allclose(after.q_dot, u, atol=1e-12)

@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 MAKER = runpy.run_path(str(ROOT / "docs" / "annotated.py"))
-definition = MAKER["definition"]
+definition, name_of = MAKER["definition"], MAKER["name_of"]
 PAGE = ROOT / "PAPER.md"
 PAPER, LINKS = PAGE.read_text().split(
     "<!-- links: written by `python tests/paper/test_paper.py` -->\n"
@@ -157,14 +157,41 @@ def test_docstrings_and_rows__name_each_other() -> None:
         assert any(row.startswith(tag) for tag in of_module), f"{module} does not name {row}"
 
 
+# --- tests use the code of their row --------------------------------------------------------------
+
+
+@cache
+def parts(path: Path) -> dict[str, ast.stmt]:
+    """Definitions of a test file, and of the modules of `tests/` that it imports, by name."""
+    found: dict[str, ast.stmt] = {}
+    for node in parsed(path).body:
+        if name := name_of(node):
+            found[name] = node
+        helpers = ROOT / "tests" / f"{getattr(node, 'module', None)}.py"
+        if isinstance(node, ast.ImportFrom) and helpers.exists():
+            found |= parts(helpers)
+    return found
+
+
+def names_used(path: Path, test: str) -> set[str]:
+    """Names in a test and in all that it calls of its file and of helpers; imported modules."""
+    imports = re.findall(r"^(?:from|import) brokk_min(.*)", path.read_text(), re.M)
+    names = set(re.findall(r"\w+", " ".join(imports))) & {s for s in LABELS if "." not in s}
+    ahead = [test]
+    while ahead:
+        for node in ast.walk(parts(path)[ahead.pop()]):
+            for field in ("id", "attr", "arg", "value"):
+                name = getattr(node, field, None)
+                if isinstance(name, str) and name not in names:
+                    names.add(name)
+                    ahead += [name] if name in parts(path) else []
+    return names
+
+
 @pytest.mark.parametrize(("code", "test"), [row[:2] for row in ROWS if labels(row[1])])
 def test_tests__use_the_code_of_their_row(code: str, test: str) -> None:
-    """By name, in their files or in the helpers that these import."""
-    texts = [place_of(name)[0].read_text() for name in labels(test)]
-    helpers = re.findall(r"^from (helpers_\w+|strategies) import", "\n".join(texts), re.M)
-    texts += [(ROOT / "tests" / f"{name}.py").read_text() for name in helpers]
-    words = set(re.findall(r"\w+", " ".join(texts)))
-    missing = {symbol for symbol in labels(code) if symbol.rpartition(".")[2] not in words}
+    used = set().union(*(names_used(place_of(name)[0], name) for name in labels(test)))
+    missing = {symbol for symbol in labels(code) if symbol.rpartition(".")[2] not in used}
     assert not missing, f"{test} do not use {missing}"
 
 

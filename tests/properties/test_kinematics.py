@@ -1,4 +1,4 @@
-"""Kinematics of any machine: an independent formula, derivatives, symmetries, batches."""
+"""Kinematics of any machine: an independent formula, derivatives, single precision."""
 
 from __future__ import annotations
 
