@@ -166,7 +166,7 @@ def compare(**variants: Figures) -> Figures:
 
 
 def d5() -> Figures:
-    """Policies trained with the costs of valve travel and of large commands, and without one."""
+    """Policies trained with the costs of valve travel and of large commands, and with one alone."""
     without = {}
     for name in ("TRAVEL_COST", "EFFORT_COST"):
         with mock.patch.object(interface, name, 0.0):
