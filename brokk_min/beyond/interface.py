@@ -47,16 +47,17 @@ from brokk_min import env
 from brokk_min.beyond.valve_nets import open_indicator, opening
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
-from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, side
+from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, side, valve_opening
 
 INTEGRAL_TIME = 4.0  # s, tuned: time constant of the error integral's leak
 ALONG, ACROSS = 0.02, 0.07  # of tool_speed, tuned: velocity errors count up to here
 COMPENSATION = 0.01  # of an action, assumed: up to here a command rises to the dead zone
 REST_AFTER = 0.1  # s of a zero goal, after which the valves close (tuned)
 FADE = 2 / 13  # of the history, tuned: e-fold of the weights of older velocities and commands
+WIDER, EARLY, LATE = 1.25, 0.25, 0.4  # tuned: times as wide, so many s after a valve was closed
 EFFORT_COST = 0.03  # tuned: if all commands are at the limit
 TRAVEL_COST = 0.1  # tuned: if all commands change by the limit in a tick
-INTEGRAL_COST = 1.5  # tuned: of a metre of the error integral in a tick
+INTEGRAL_COST = 2.0  # tuned: of a metre of the error integral in a tick
 
 
 class Memory(NamedTuple):
@@ -66,6 +67,7 @@ class Memory(NamedTuple):
     v_tool: Array  # measured velocity of the tool, see `remember` [m/s], (..., 3)
     error_integral: Array  # leaky integral of the velocity error [m], (..., 3)
     rest_ticks: NDArray[np.int64]  # for which the goal has been zero, (...)
+    open_ticks: NDArray[np.int64]  # since each valve was closed; 0: now, or not lately, (..., n)
 
 
 def remember(machine: Machine, memory: Memory | None, measured: Measured) -> Memory:
@@ -92,10 +94,13 @@ def accumulate(machine: Machine, memory: Memory | None, measured: Measured) -> M
     is zero, up to 7 %. The goal is that of the tick that has ended.
     """
     v_goal, v_tool = measured.v_goal, measured.v_tool
+    u, zones = measured.history[..., 2, :], machine.dead_zones[machine.driven, None]
+    closed = valve_opening(u, zones) == 0
+    open_ticks = np.argmax(closed[..., ::-1], axis=-1)
     at_rest = np.asarray(~v_goal.any(axis=-1))
     if memory is None:
         zero = np.zeros_like(v_goal, np.float32)
-        return Memory(v_goal, v_tool, zero, np.asarray(at_rest, np.int64))
+        return Memory(v_goal, v_tool, zero, np.asarray(at_rest, np.int64), open_ticks)
     error = memory.v_goal - v_tool
     speed = np.linalg.norm(memory.v_goal, axis=-1, keepdims=True)
     direction = memory.v_goal / np.maximum(speed, 1e-6)  # 0 for a zero goal
@@ -106,7 +111,7 @@ def accumulate(machine: Machine, memory: Memory | None, measured: Measured) -> M
     error = np.clip(along, -limit, limit) * direction + across
     integral = np.exp(-machine.dt / INTEGRAL_TIME) * (memory.error_integral + machine.dt * error)
     ticks = np.where(at_rest, memory.rest_ticks + 1, 0)
-    return Memory(v_goal, v_tool, integral.astype(np.float32), ticks)
+    return Memory(v_goal, v_tool, integral.astype(np.float32), ticks, open_ticks)
 
 
 def resting(machine: Machine, memory: Memory) -> NDArray[np.bool_]:
@@ -177,11 +182,15 @@ def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
 def command(machine: Machine, action: Array, memory: Memory) -> Array:
     """u (..., n) = zone clip(a / 0.01, -1, 1) + (limit - zone) a of actions (..., n_driven).
 
-    It is 0 once the goal has been 0 for 0.1 s; until then the agent may brake.
+    It is 0 once the goal has been 0 for 0.1 s; until then the agent may brake. A closed valve
+    answers late, so from 0.25 to 0.4 s after it was closed a counts 1.25 times.
 
     An action of 0.01 therefore begins to open a valve, and valves close at rest. Paper: Sec. 3.3
     """
     a = np.asarray(action)
+    early, late = (round(seconds * machine.rate) for seconds in (EARLY, LATE))
+    starts = (memory.open_ticks >= early) & (memory.open_ticks < late)
+    a = np.clip(a * np.where(starts, WIDER, 1).astype(a.dtype), -1, 1)
     zone = side(a, machine.dead_zones[machine.driven])
     u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
     u[..., machine.driven] = zone * np.clip(a / COMPENSATION, -1, 1)
@@ -190,7 +199,7 @@ def command(machine: Machine, action: Array, memory: Memory) -> Array:
 
 
 def cost(machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
-    """0.03 mean (u / limit)^2 + 0.1 mean |u - u_before| / limit + 1.5 |integral| [m], (...).
+    """0.03 mean (u / limit)^2 + 0.1 mean |u - u_before| / limit + 2 |integral| [m], (...).
 
     Some motions of more than three joints cancel at the tool. The first term keeps the policy from
     them, because in the end they push a joint against its stop.

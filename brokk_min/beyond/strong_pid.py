@@ -113,7 +113,7 @@ class StrongPID(JacobianController):
         opening = gains.kp * error + before.integral + gains.kd * derivative  # PID
         steady = self.feedforward.command(q[..., m.driven], q_dot_goal)
         opening = opening + valve_opening(steady, m.dead_zones[m.driven])
-        u = self.command(self.widen(opening, measured))
+        u = self.command(self.widen(opening, measured, memory))
         full = np.abs(np.rint(u[..., m.driven] * PWM_MAX)) >= m.pwm_limit
         saturated = full & (np.sign(opening) == np.sign(error))
         closed = resting(m, memory)[..., None]
@@ -121,14 +121,13 @@ class StrongPID(JacobianController):
         pid = PIDState(before.integral + increase, error, derivative, q_dot_goal)
         return np.where(closed, 0.0, u), (pid, memory)
 
-    def widen(self, opening: Array, measured: Measured) -> Array:
+    def widen(self, opening: Array, measured: Measured, memory: Memory) -> Array:
         """Openings (..., n_driven), wider where a valve starts, at least `min_opening` in motion.
 
         A closed valve answers late (Sec. 3.2), so it opens wider in its first ticks.
         """
         m, gains = self.machine, self.gains
-        idle = valve_opening(measured.history[..., 2, :], m.dead_zones[m.driven, None]) == 0
-        ticks = np.argmax(idle[..., ::-1], axis=-1)  # since it was closed; 0: now, or never in H
+        ticks = memory.open_ticks
         starts = (ticks > 0) & (ticks * m.dt < gains.start_time)
         opening = opening * np.where(starts, 1 + gains.start_boost, 1.0)
         moving = np.linalg.norm(measured.v_goal, axis=-1, keepdims=True) > 1e-6

@@ -34,8 +34,8 @@ from brokk_min.machine import BROKK_170
 V_TOOL = (0.05, -0.02, 0.09)  # m/s
 
 
-def memory(rest_ticks: int | list[int] = 0, integral: tuple[float, ...] = (0.0,) * 3) -> Memory:
-    return Memory(np.zeros(3), np.array(V_TOOL), np.array(integral), np.array(rest_ticks))
+def memory(rest_ticks=0, integral=(0.0,) * 3, open_ticks=0) -> Memory:
+    return Memory(*map(np.array, ([0.0] * 3, V_TOOL, integral, rest_ticks, open_ticks)))
 
 
 def test_smooth_angles__by_hand():
@@ -144,6 +144,14 @@ def test_command__is_piecewise_linear_beyond_each_valves_own_dead_zone(machine, 
         exact = np.sign(a) * np.interp(abs(a), [0, 0.01, 1], [0, knee, machine.pwm_limit])
         assert u[j] == pytest.approx(exact if joint.driven else 0, abs=0.5 + 1e-6)
         assert u[j] == round(u[j], 9)
+
+
+def test_command__opens_a_valve_wider_shortly_before_it_answers():
+    """1.25 times from 0.25 to 0.4 s after it was closed, each valve by itself; at most fully."""
+    u = command(BROKK_170, np.full(4, 0.5), memory(open_ticks=[4, 5, 7, 8]))
+    plain, wide = (command(BROKK_170, np.full(4, a), memory())[DRIVEN] for a in (0.5, 0.625))
+    assert u[DRIVEN].tolist() == [plain[0], wide[1], wide[2], plain[3]]
+    assert np.abs(command(BROKK_170, np.ones(4), memory(open_ticks=5))).max() * 127 == 80
 
 
 def test_command__closes_the_valves_after_a_tenth_of_a_second_without_a_goal():

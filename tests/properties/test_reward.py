@@ -159,6 +159,6 @@ def test_cost__of_our_agent_is_of_commands_valve_travel_and_error_integral(case,
         travel = 0.1 * sum(changes) / len(changes)
         squares = [(u[i, j] * 127 / machine.pwm_limit) ** 2 for j in machine.driven]
         effort = 0.03 * sum(squares) / len(squares)
-        integral = 1.5 * math.sqrt(sum(float(x) ** 2 for x in memory.error_integral[i]))
+        integral = 2.0 * math.sqrt(sum(float(x) ** 2 for x in memory.error_integral[i]))
         np.testing.assert_allclose(found[i], effort + travel + integral, atol=1e-7)
     assert PAPER.cost(machine, u, before, None) == 0
