@@ -26,7 +26,7 @@ from brokk_min.learning.policy import KIND, load_policy, save_policy
 from brokk_min.machine import BROKK_170
 
 READERS = {
-    "x.npz": lambda path: load_arrays(path, "policy 7"),
+    "x.npz": lambda path: load_arrays(path, "policy 8"),
     "x.json": lambda path: read_json(path, "results"),
     "x.csv": lambda path: numbers(path, "u", read_csv(path, "time", "u")["u"]),
 }
@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
 def write_good(path: Path) -> bytes:
     """A good file of each kind; its bytes."""
     if path.suffix == ".npz":
-        save_arrays(path, "policy 7", {"joints": ["q1"]}, w=np.arange(6.0).reshape(2, 3))
+        save_arrays(path, "policy 8", {"joints": ["q1"]}, w=np.arange(6.0).reshape(2, 3))
     elif path.suffix == ".json":
         _files.write_json(path, {"runs": [{"sequence": "x", "reward": 0.5}]})
     else:

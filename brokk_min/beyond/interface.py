@@ -4,8 +4,8 @@ What it changes: of the paper's observation (`env`) our agent reads the newer ha
 commands, and one smoothed angle of each joint; its velocity of the tool is as old as those of the
 joints. It also reads which of these commands opened valves, the joint velocities that would give
 the goal, and those that would undo the velocity error so far. Its actions begin beyond the dead
-zone, its valves close while the tool rests, and it pays for large commands, valve travel and error
-that lasts.
+zone, its valves open wider as they start and close while the tool rests, and it pays for large
+commands, valve travel and error that lasts.
 
 What it buys, in order, trained with `group_advantages` on our nets for one million steps (means of
 three seeds along x, y and z, `benchmarks.ladder`):
@@ -67,7 +67,7 @@ class Memory(NamedTuple):
     v_tool: Array  # measured velocity of the tool, see `remember` [m/s], (..., 3)
     error_integral: Array  # leaky integral of the velocity error [m], (..., 3)
     rest_ticks: NDArray[np.int64]  # for which the goal has been zero, (...)
-    open_ticks: NDArray[np.int64]  # since each valve was closed; 0: now, or not lately, (..., n)
+    open_ticks: NDArray[np.int64]  # since each valve was closed; 0: now, long ago, (..., n_driven)
 
 
 def remember(machine: Machine, memory: Memory | None, measured: Measured) -> Memory:
