@@ -1,9 +1,10 @@
 """What the deviations and assumptions of PAPER.md change, measured.
 
-    python -m benchmarks.deviations [d1 ...] [--train]
+    python -m benchmarks.deviations [d1 ...]
+    python -m benchmarks.deviations --train
 
-Each function returns the figures of one entry of docs/deviations.md. D5 and D7 train policies:
-`--train`, some 15 minutes. The name of an entry prints that entry alone. `benchmarks.ladder` has
+Each function returns the figures of one entry of docs/deviations.md, and the name of an entry
+prints that entry alone. D5 and D7 train policies, for some five minutes. `benchmarks.ladder` has
 what the parts of our agent are worth in other learners.
 """
 
@@ -12,9 +13,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -26,9 +27,9 @@ from brokk_min.actuator import PLANT, estimate_velocity
 from brokk_min.beyond import interface
 from brokk_min.env import terminated
 from brokk_min.evaluation import metrics, preliminary, sequences
-from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
+from brokk_min.evaluation.baselines import OPTIMISED, read_gains
 from brokk_min.evaluation.rollout import rollout
-from brokk_min.identification import excitation, logs
+from brokk_min.identification import excitation
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy
 from brokk_min.learning.checkpoint import train_policy
@@ -80,29 +81,6 @@ def d3() -> Figures:
     return {"one tick": np.std(np.diff(q) * M.rate), "4 samples": np.std(slopes)}
 
 
-def a9() -> Figures:
-    """Fraction of poses above the ground from which each sequence, and all three, are feasible."""
-    q = np.random.default_rng(0).uniform(LOW, HIGH, (3000, M.n))
-    q = q[~terminated(M, kinematics.lowest_point(forward_kinematics(M, q)))]
-    followed = {}
-    for sequence in sequences.axis_sequences(M):
-        goals = np.repeat(sequence.goals[:, None], len(q), axis=1)
-        followed[sequence.name] = sequences.feasible(M, q, goals)
-    followed["all"] = np.all(list(followed.values()), axis=0)
-    return {name: rows.mean() for name, rows in followed.items()}
-
-
-def a6() -> Figures:
-    """Velocity error [m/s] of the PID with gains by hand, with and without the noise."""
-    pid = baselines(M, policy.load_policy(POLICY, M).net)["pid_by_hand"]
-    start, goals = sequences.tuning_set(M, 16, seed=2)
-    errors = {}
-    for name, noise in (("5 %", 0.05), ("none", 0.0)):
-        trace = rollout(M, pid, start, goals, noise, np.random.default_rng(0))
-        errors[name] = norm(goals - trace.v_tool, axis=-1).mean()
-    return errors
-
-
 def d9() -> Figures:
     """Error [m/s] of the optimised PID on plant and nets; median gap [m] of nets after 30 s."""
     ours, printed = (policy.load_policy(POLICY.with_name(name), M).net for name in NETS_OF)
@@ -122,8 +100,7 @@ def levels() -> Figures:
     result = {}
     for kind in ("sine", "rich"):
         log = excitation.collect(M, 0.5, kind, np.random.default_rng(0))
-        driven = [r for r in log.recordings if not r.name.endswith(logs.RETURN)]
-        size = np.concatenate([np.abs(r.u).max(axis=1)[M.history :] for r in driven])
+        size = np.concatenate([np.abs(r.u).max(axis=1)[M.history :] for r in log.recordings])
         counts = (size * PWM_MAX).round()
         result[f"{kind}, in the dead zone"] = np.mean(size <= M.dead_zones.min())
         result[f"{kind}, 8 to 15 counts"] = np.mean((counts >= 8) & (counts <= 15))
@@ -133,11 +110,11 @@ def levels() -> Figures:
 # --- by training ----------------------------------------------------------------------------------
 
 
-def train(steps: int) -> Figures:
+def train() -> Figures:
     """Error [m/s], drift [m], travel, time at stops [s] of a new policy along x, y, z."""
     net = policy.load_policy(POLICY, M).net
     recipe = find_recipe()
-    recipe = replace(recipe, learner=replace(recipe.learner, total_steps=steps))
+    recipe = replace(recipe, learner=replace(recipe.learner, total_steps=STEPS))
     with TemporaryDirectory() as folder:
         trained = train_policy(M, net, recipe, 0, Path(folder) / "policy.npz")
     controllers = {"rl": trained}
@@ -151,44 +128,24 @@ def train(steps: int) -> Figures:
     return result
 
 
-@cache
-def default_training() -> Figures:
-    """The training with which the others are compared."""
-    return train(STEPS)
+def trained() -> Figures:
+    """D5, D7: our agent, without the one and the other cost, and with the newest angles alone."""
+    changes: dict[str, Any] = {"TRAVEL_COST": 0.0, "EFFORT_COST": 0.0}
+    changes["smooth_angles"] = lambda _, history: history[..., 0, -1]
+    result = {f"ours, {name}": value for name, value in train().items()}
+    for what, new in changes.items():
+        with mock.patch.object(interface, what, new):
+            result |= {f"other {what}, {name}": value for name, value in train().items()}
+    return result
 
 
-def compare(**variants: Figures) -> Figures:
-    """Figures of several variants in one table."""
-    table = {}
-    for variant, figures in variants.items():
-        table |= {f"{variant}, {name}": value for name, value in figures.items()}
-    return table
-
-
-def d5() -> Figures:
-    """Policies trained with the costs of valve travel and of large commands, and with one alone."""
-    without = {}
-    for name in ("TRAVEL_COST", "EFFORT_COST"):
-        with mock.patch.object(interface, name, 0.0):
-            without[f"no {name}"] = train(STEPS)
-    return compare(ours=default_training(), **without)
-
-
-def d7() -> Figures:
-    """Policies that read the newest angles, also for resolved velocities, and smoothed ones."""
-    with mock.patch.object(interface, "smooth_angles", lambda _, history: history[..., 0, -1]):
-        newest_angles = train(STEPS)
-    return compare(newest_angles=newest_angles, ours=default_training())
-
-
-MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, a6, a9, d9, levels)
-TRAINED: tuple[Callable[[], Figures], ...] = (d5, d7)
+MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d9, levels)
 
 
 def main(words: list[str]) -> None:
-    """Print the entries that are named; without names all, or with `--train` those that train."""
-    named = [entry for entry in MEASURED + TRAINED if entry.__name__ in words]
-    for entry in named or (TRAINED if "--train" in words else MEASURED):
+    """Print the entries that are named, or all; with `--train` D5 and D7."""
+    named = [entry for entry in MEASURED if entry.__name__ in words]
+    for entry in [trained] if "--train" in words else named or MEASURED:
         figures = ", ".join(f"{name} {value:.4g}" for name, value in entry().items())
         print(f"{entry.__name__.upper():4} {entry.__doc__}\n     {figures}", flush=True)
 

@@ -13,7 +13,7 @@ os.environ["MPLBACKEND"] = "agg"  # we draw into files; a notebook's would be re
 import tyro
 
 from brokk_min import __version__
-from brokk_min._files import one_line
+from brokk_min._files import brief
 
 COMMANDS = {  # module and class in `cli`, and what the command does
     "collect": ("identification", "Collect", "record a machine under excitation"),
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
         command = getattr(import_module(f"brokk_min.cli.{module}"), function)
         tyro.cli(command, args=arguments[1:], default=command.defaults(arguments), **options)()
     except (ValueError, OSError, MemoryError, ImportError) as error:
-        print(f"brokk-min: {one_line(error)}", file=sys.stderr)
+        print(f"brokk-min: {brief(error, longest=10_000)}", file=sys.stderr)
         return 2 if type(error).__name__ == "WrongUse" else 1
     except KeyboardInterrupt:
         print("brokk-min: stopped", file=sys.stderr)

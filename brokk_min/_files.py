@@ -70,46 +70,33 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]])
         writer.writerows(rows)
 
 
-def one_line(value: Any) -> str:
-    """A value, or what an error says, as text of one line."""
+def brief(value: Any, longest: int = 110) -> str:
+    """A value, or what an error says, as text of one line, without the middle of a long one."""
     if isinstance(value, OSError) and value.strerror:
         place = f"{value.filename}: " if value.filename else ""
         return f"{place}{value.strerror.lower()}"
     text = str(value) or type(value).__name__ if isinstance(value, Exception) else repr(value)
-    return " ".join(text.split())
-
-
-def brief(value: Any) -> str:
-    """`one_line` of at most some hundred characters."""
-    text = one_line(value)
-    return text if len(text) <= 110 else f"{text[:70]} ... {text[-30:]}"
+    text = " ".join(text.split())
+    return text if len(text) <= longest else f"{text[:70]} ... {text[-30:]}"
 
 
 @contextmanager
 def expected(path: Path, what: str) -> Iterator[None]:
     """Turn any error of the block into a ValueError: `path` is not `what`.
 
-    Errors that name `path` already stay as they are, and so do those of the operating system.
+    Errors of the operating system stay as they are, and a ValueError that says what was expected
+    only gets `path` in front of it.
     """
     try:
         yield
     except OSError:
         raise
     except Exception as error:  # zipfile, zlib, json and NumPy raise anything on damaged files
-        if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
+        told = isinstance(error, ValueError) and ": expected " in str(error)
+        if told and str(error).startswith(f"{path}: "):
             raise
-        raise ValueError(f"{path}: expected {what}, got {brief(error)}") from error
-
-
-@contextmanager
-def located(*paths: Path) -> Iterator[None]:
-    """Put the first of these files in front of a ValueError of the block that names none."""
-    try:
-        yield
-    except ValueError as error:
-        if str(error).startswith(tuple(f"{path}: " for path in paths)):
-            raise
-        raise ValueError(f"{paths[0]}: {error}") from error
+        reason = error if told else f"expected {what}, got {brief(error)}"
+        raise ValueError(f"{path}: {reason}") from error
 
 
 def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
@@ -153,7 +140,7 @@ def numbers(path: Path, name: str, cells: Iterable[str]) -> NDArray[Any]:
 
 
 def save_arrays(path: Path, kind: str, header: Mapping[str, Any], **arrays: Any) -> None:
-    """Write arrays and a JSON header as one `.npz`; `kind` says what it is, as "policy 7"."""
+    """Write arrays and a JSON header as one `.npz`; `kind` says what it is, as "policy 8"."""
     text = np.array(json.dumps({"kind": kind, **header}))
     with whole_file(path) as file:
         np.savez_compressed(file, header=text, **arrays)

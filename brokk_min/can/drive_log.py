@@ -86,22 +86,16 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
 
     ValueError: nothing was driven for long enough.
     """
-    recordings: list[list[Telemetry]] = [[]]
+    ticks = [t for t in read_telemetry(machine, frames) if t.driving and np.isfinite(t.q).all()]
+    time = np.array([tick.time for tick in ticks])
+    u, q = (np.reshape([getattr(t, name) for t in ticks], (-1, machine.n)) for name in ("u", "q"))
     reach = FASTER * machine.q_dot_max * machine.dt + NOISE  # of an angle in a tick
-    for tick in read_telemetry(machine, frames):
-        if not (tick.driving and np.isfinite(tick.q).all()):
-            continue
-        last = recordings[-1][-1] if recordings[-1] else tick._replace(time=tick.time - machine.dt)
-        on_time = 0.5 < (tick.time - last.time) * machine.rate < 1.5
-        if not on_time or (np.abs(tick.q - last.q) > reach).any():
-            recordings.append([])
-        recordings[-1].append(tick)
-    longest, least = max(map(len, recordings)), machine.history + 2
+    gap = np.abs(np.diff(time) * machine.rate - 1) >= 0.5
+    jump = (np.abs(np.diff(q, axis=0)) > reach).any(axis=1)
+    pieces = np.split(np.arange(len(ticks)), np.flatnonzero(gap | jump) + 1)
+    longest, least = max(map(len, pieces)), machine.history + 2
     wanted = f"{least} ticks of driving in a row at {machine.rate:g} Hz (--machine)"
     require(longest >= least, "log", wanted, f"{longest} at most")
-    named = [
-        (f"drive_{k:03d}", np.array([t.u for t in ticks]), np.array([t.q for t in ticks]))
-        for k, ticks in enumerate(recordings)
-        if len(ticks) >= least
-    ]
+    long = [rows for rows in pieces if len(rows) >= least]
+    named = [(f"drive_{k:03d}", u[rows], q[rows]) for k, rows in enumerate(long)]
     return machine_log(machine, named)

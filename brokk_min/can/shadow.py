@@ -29,8 +29,7 @@ class Shadow(hw.Drive):
         super().__init__(machine, controller, bus, operator or self.follow)
         bus.allowed = (canopen.NMT, canopen.SYNC) if sync else ()
         self.sync = sync
-        self.would_send: Array = np.zeros(machine.n)  # counts of 127
-        self.pairs: list[tuple[Array, Array]] = []  # it and what was sent, while it would drive
+        self.pairs: list[tuple[Array, Array]] = []  # would send, was sent; while it would drive
         self.faults: Counter[str] = Counter()  # ticks with each
 
     def begin(self) -> None:
@@ -58,7 +57,7 @@ class Shadow(hw.Drive):
         recent = self.nodes.enable and self.bus.now() - self.nodes.valve_time < canopen.WATCHDOG
         sent = np.rint(PWM_MAX * self.nodes.u * recent)
         if self.gate.driving:
-            self.pairs.append((self.would_send, sent))
+            self.pairs.append((self.gate.sent[:, -1], sent))
         moved_by = self.gate.sent.copy()  # history and gate go on from what was sent
         moved_by[:, -1] = sent
         self.gate = self.gate._replace(sent=moved_by)
@@ -86,7 +85,6 @@ class Shadow(hw.Drive):
     def send_command(self, command: Array, counts: Array) -> None:
         """Pass the gate, and keep what it says."""
         super().send_command(command, counts)
-        self.would_send = self.gate.sent[:, -1]
         if self.gate.active_fault and self.ticks > 1:  # the first tick always counts as late
             self.faults[fault_name(self.machine, int(self.gate.active_fault))] += 1
 

@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
-from brokk_min._files import brief, located, write_json
+from brokk_min._files import brief, expected, write_json
 from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.cli.options import Command, check, check_settings, find_plant
 from brokk_min.identification import columns, excitation, logs
@@ -59,8 +59,8 @@ class ReadsLogs(Command):
         machine, mapped = self.find_machine(), columns.parse_map(self.map)
         found = {}
         for path in paths:
-            with located(path):
-                if columns.is_table(path):
+            with expected(path, "a log"):
+                if path.is_dir() or path.suffix.lower() in columns.TABLES:
                     found[path] = logs.read_log(path, machine, mapped, self.topics)
                 else:
                     require(not mapped, "--map", "a table or a recording of ROS", "a CAN log")
@@ -69,8 +69,7 @@ class ReadsLogs(Command):
         known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
         if machine == BROKK_170 and set(log.joints) != set(known):
             return log, None
-        with located(*paths):
-            return logs.in_order(log, known), machine
+        return logs.in_order(log, known), machine
 
 
 @dataclass(kw_only=True)
@@ -90,10 +89,9 @@ class Inspect(ReadsLogs):
         warnings, scores = inspection.warnings(log, reports, known), {}
         if self.net:
             net, window = load_net(self.net), self.find_machine().velocity_samples
-            with located(self.net):
-                same = net.velocity_samples == window
-                require(same, "velocity_samples", f"{window} of --machine", net.velocity_samples)
-                scores = validation.score(net, logs.in_order(log, net.joints))
+            wanted, got = f"velocity_samples {window} of --machine", net.velocity_samples
+            require(got == window, str(self.net), wanted, got)
+            scores = validation.score(net, logs.in_order(log, net.joints))
         if self.json:
             joints = {name: asdict(report) for name, report in reports.items()}
             write_json(self.json, {"joints": joints, "scores": scores, "warnings": warnings})
@@ -133,15 +131,13 @@ class Fit(ReadsLogs):
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs)
         test = self.read_logs(self.test)[0] if self.test else None
-        with located(*self.logs):
-            if test is None:
-                log, test = logs.split(log)
-            reports = inspection.inspect(log)
-            for wrong in inspection.wrong_signs(reports):
-                raise ValueError(wrong)
-            net = fitting.fit(log, self.settings, self.seed, machine, known.name if known else "")
-        with located(*self.test, *self.logs):
-            scores = validation.score(net, logs.in_order(test, log.joints))
+        if test is None:
+            log, test = logs.split(log)
+        reports = inspection.inspect(log)
+        for wrong in inspection.wrong_signs(reports):
+            raise ValueError(wrong)
+        net = fitting.fit(log, self.settings, self.seed, machine, known.name if known else "")
+        scores = validation.score(net, logs.in_order(test, log.joints))
         warnings = validation.warnings(scores) + inspection.warnings(log, reports, known)
         save_net(self.out, net)
         if self.json:

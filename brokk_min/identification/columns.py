@@ -20,6 +20,7 @@ from brokk_min.machine import Array, require
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 KINDS = ("u_", "q_")  # of columns that are read, beside run and time
+TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # names of files that `load_table` reads
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
 Mapped = dict[str, tuple[str, float]]  # column of the log: that of the file, and its factor
 
@@ -42,11 +43,6 @@ def parse_map(text: str) -> Mapped:
         require(fits, "--map", wanted, repr(part))
         result[of_log] = (column, factor)
     return result
-
-
-def is_table(path: Path) -> bool:
-    """Does `load_table` read this, by its name?"""
-    return path.is_dir() or path.suffix.lower() in (".csv", ".npz", ".mcap", ".db3", ".bag")
 
 
 def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> dict[str, Any]:

@@ -83,12 +83,6 @@ class TrainingSet:
     q_high: Tensor  # rad, (n,)
     rate: float  # of the samples [Hz]
 
-    def inputs(self, history: Tensor) -> Tensor:
-        """What the nets read of histories (batch, n, 3, H): (batch, n, I)."""
-        if self.zones is None:
-            return history.flatten(-2)
-        return valve_inputs(history, self.zones, torch)  # type: ignore[no-any-return]
-
 
 def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) -> TrainingSet:
     """Windows in which a joint moves, and their statistics; ValueError: one that never moves."""
@@ -210,7 +204,8 @@ def accumulated_loss(data: TrainingSet, weights: list[Tensor], at: Tensor, ticks
 def predict(data: TrainingSet, weights: list[Tensor], history: Tensor) -> Tensor:
     """Velocities [rad/s] (batch, n) for histories (batch, n, 3, H); none passes a stop."""
     w1, b1, w2, b2, w3, b3 = weights
-    x = data.reads * (data.inputs(history) - data.input_mean) / data.input_scale
+    read = history.flatten(-2) if data.zones is None else valve_inputs(history, data.zones, torch)
+    x = data.reads * (read - data.input_mean) / data.input_scale
     x = torch.relu(torch.baddbmm(b1[:, None], x.transpose(0, 1), w1))
     x = torch.relu(torch.baddbmm(b2[:, None], x, w2))
     y = torch.sigmoid(torch.baddbmm(b3[:, None], x, w3))[..., 0].T

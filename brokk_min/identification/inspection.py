@@ -130,16 +130,12 @@ def followed_joints(log: Log, j: int) -> dict[str, float]:
         recent = np.convolve(np.abs(one.u[:, j]) > COMMANDED, np.ones(still))[: len(one.u)]
         idle.append(np.where(recent[:, None] == 0, one.q_dot, 0.0))
     q_dot = np.concatenate(idle)
-    result = {}
-    for i, name in enumerate(log.joints):
-        power = float(q_dot[:, i] @ q_dot[:, i])
-        slope = float(q_dot[:, i] @ q_dot[:, j]) / max(power, 1e-12)
-        moves = q_dot[:, i] != 0
-        error = q_dot[moves, j] - slope * q_dot[moves, i]
-        follows = error @ error < (1 - FOLLOWS) * slope**2 * power
-        if i != j and abs(slope) > FOLLOWS and follows:
-            result[name] = slope
-    return result
+    power = np.square(q_dot).sum(axis=0)
+    slopes = q_dot.T @ q_dot[:, j] / np.maximum(power, 1e-12)
+    errors = np.where(q_dot != 0, q_dot[:, [j]] - slopes * q_dot, 0.0)
+    close = np.square(errors).sum(axis=0) < (1 - FOLLOWS) * slopes**2 * power
+    follows = close & (np.abs(slopes) > FOLLOWS) & (np.arange(len(slopes)) != j)
+    return {log.joints[i]: float(slopes[i]) for i in np.flatnonzero(follows)}
 
 
 def fit_model(motion: Motion) -> dict[str, Any]:

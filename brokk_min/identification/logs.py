@@ -4,7 +4,7 @@ Columns `run,time,u_<joint>...,q_<joint>...`, one row per sample; `.csv`, or `.n
 columns as arrays. `run` is the name of the recording, time is in s, u in [-1, 1] of full command
 (held until the next row), q in rad (m of prismatic joints). Other columns are not read: velocities
 are estimated, because a bus carries angles alone. Joints may have any names. The rate must not be
-below the machine's, and it may jitter. Recordings whose name ends in `_return` are dropped.
+below the machine's, and it may jitter.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min._files import brief, expected, located, whole_file, write_csv
+from brokk_min._files import brief, expected, whole_file, write_csv
 from brokk_min.actuator import estimate_velocity
 from brokk_min.identification.columns import TOPICS, Mapped, load_table
 from brokk_min.identification.readings import MAX_GAP, check_run, left_out, unread
@@ -23,9 +23,8 @@ from brokk_min.machine import Array, Machine, require
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
 MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
-MEAN_OF = 10  # values of a command in a tick, of logs that are faster
+MEAN_OF = 10  # values of a command in a tick
 LARGEST = 1e12  # of numbers in a log, assumed: any time, angle or velocity
-RETURN = "_return"
 Rows = NDArray[np.intp]
 
 
@@ -138,7 +137,7 @@ def join_logs(logs: Mapping[Path, Log]) -> Log:
     first = next(iter(logs.values()))
     joined: list[Log] = []
     for path, log in logs.items():
-        with located(path):
+        with expected(path, "a log"):
             joined.append(in_order(log, first.joints))
     recordings = tuple(one for log in joined for one in log.recordings)
     require(len(recordings) > 0, ", ".join(map(str, logs)), "at least one recording", "none")
@@ -168,7 +167,7 @@ def read_log(
 ) -> Log:
     """Check the table of a file, see `load_table`, and resample it at the rate of `machine`.
 
-    The command is held (of faster logs it is the mean over a tick), the angle interpolated. A gap
+    The command is held, and of a tick is its mean; the angle is interpolated. A gap
     longer than `MAX_GAP` and 2.5 samples cuts a recording, and so does an angle that jumps; rows in
     which a joint was not read count as a gap. A recording starts at rest; after a gap the rows are
     left out whose velocity would need samples of the gap. The joints may be others than those of
@@ -176,7 +175,7 @@ def read_log(
     ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
     table = load_table(path, mapped or {}, topics)
-    with expected(path, "a log"), located(path):
+    with expected(path, "a log"):
         joints = tuple(name[2:] for name in table if name.startswith("u_"))
         wanted = "u_<joint> (--map u_NAME=COLUMN:UNIT)"
         require(len(joints) > 0, "columns", wanted, brief(list(table)))
@@ -216,10 +215,9 @@ def _recordings(
 
 
 def _runs(names: Any) -> dict[str, Rows]:
-    """Rows of each recording, in the order in which they begin, without returns."""
+    """Rows of each recording, in the order in which they begin,"""
     unique, first, number = np.unique(names, return_index=True, return_inverse=True)
-    rows = {str(unique[i]): np.flatnonzero(number == i) for i in np.argsort(first)}
-    return {run: of for run, of in rows.items() if not run.endswith(RETURN)}
+    return {str(unique[i]): np.flatnonzero(number == i) for i in np.argsort(first)}
 
 
 def _numbers(table: Mapping[str, Any], names: Sequence[str]) -> Array:
@@ -245,8 +243,7 @@ def _resample(
     """u held, q of `rows` interpolated at the machine's rate, and q_dot estimated."""
     t, rate = time[rows], machine.rate
     grid = t[0] + np.arange(int((t[-1] - t[0]) * rate + 1e-6) + 1) / rate
-    fast = len(time) > 1 and np.median(np.diff(time)) < 0.501 / rate
-    parts = np.linspace(0, 1 / rate, MEAN_OF if fast else 1, endpoint=False)[:, None]
+    parts = np.linspace(0, 1 / rate, MEAN_OF, endpoint=False)[:, None]
     held = np.searchsorted(time, grid + parts + 1e-6, side="right") - 1
     q = np.stack([np.interp(grid, t, angles) for angles in q[rows].T], axis=-1)
     return u[held].mean(axis=0), q, velocity_of(q, machine.velocity_samples, rate)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min._files import expected, load_arrays, located, save_arrays
+from brokk_min._files import expected, load_arrays, save_arrays
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet
@@ -94,6 +94,6 @@ def load_net(path: Path, machine: Machine | None = None) -> ActuatorNet:
 
     ValueError as in `net_from_arrays`, or nets that are not for the machine.
     """
-    with located(path):
+    with expected(path, "actuator nets"):
         net: ActuatorNet = net_from_arrays(path, *load_arrays(path, KIND))
         return select_nets(machine, net) if machine else net

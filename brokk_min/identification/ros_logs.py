@@ -27,17 +27,11 @@ def read_ros(path: Path, angles: str, commands: str) -> dict[str, Any]:
             require(topic in found, f"{path}: --topics", f"two of {found}", brief(topic))
         rows = list(samples(bag, angles, commands))
     require(len(rows) > 0, str(path), f"{angles} after {commands}, of the same joints", "none")
-    table: dict[str, Any] = {"time": [time for time, _, _ in rows]}
-    for name in rows[0][1]:
-        table[f"u_{name}"] = [u[name] for _, u, _ in rows]
-        table[f"q_{name}"] = [q[name] for _, _, q in rows]
-    return table
+    return {column: [row[column] for row in rows] for column in rows[0]}
 
 
-def samples(
-    bag: Any, angles: str, commands: str
-) -> Iterator[tuple[float, dict[str, float], dict[str, float]]]:
-    """Time [s], commands and angles by joint, of each message with angles after a command."""
+def samples(bag: Any, angles: str, commands: str) -> Iterator[dict[str, float]]:
+    """`time` [s], `u_` and `q_` of each joint, of each message with angles after a command."""
     order: list[str] = []
     q: dict[str, float] = {}
     u: dict[str, float] = {}
@@ -48,7 +42,8 @@ def samples(
             order = order or list(message.name)
             q |= dict(zip(message.name, message.position, strict=True))
             if u and u.keys() <= q.keys():
-                yield stamp / 1e9, u, q.copy()
+                row = {"time": stamp / 1e9} | {f"u_{name}": x for name, x in u.items()}
+                yield row | {f"q_{name}": q[name] for name in u}
         elif order:
             u = commands_of(message, order)
 

@@ -65,12 +65,11 @@ def prepare(
     """The environments of a recipe, its advantages, and the beginning of its training."""
     config = recipe.learner
     simulation = (config.num_envs, net, machine, recipe.task, INTERFACES[recipe.interface])
-    env: TaskVectorEnv
-    advantages: ppo.Advantages
-    if recipe.critic:
-        env, advantages = TaskVectorEnv(*simulation), ppo.critic_advantages
-    else:
-        env, advantages = GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
+    advantages: ppo.Advantages = ppo.critic_advantages
+    env = TaskVectorEnv(*simulation)
+    if not recipe.critic:
+        advantages = group_advantages
+        env = GroupVectorEnv(*simulation, horizon=config.horizon)
     start = ppo.begin(env, config, seed)
     if recipe.muon:
         start = start._replace(optimizer=muon(start.agent, config))

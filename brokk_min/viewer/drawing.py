@@ -24,9 +24,7 @@ GRID, SLOT, SOIL = (228, 230, 232), (212, 216, 221), (214, 203, 186)
 MEASURED = (0, 158, 115)
 BLUE, ORANGE = (0, 114, 178), (213, 94, 0)  # of the machine under the policy, under the PID
 HEAD, ROW = 72, 40  # heights of the title and of a joint's row
-NO_POINTS = np.zeros((0, 3))
 ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up of the top view
-CIRCLE = np.exp(2j * np.pi * np.arange(24)[:, None] / 24).view(float)  # corners (x, y)
 
 
 class Scene(NamedTuple):
@@ -36,7 +34,7 @@ class Scene(NamedTuple):
     u: Array  # commands [-1, 1], (n,)
     v_goal: Array  # goal velocity of the tool [m/s], (3,)
     v_tool: Array  # measured velocity of the tool [m/s], (3,)
-    trail: Array = NO_POINTS  # past tool positions [m], (T, 3)
+    trail: Array = np.zeros((0, 3))  # past tool positions [m], (T, 3)
     title: str = ""
     status: str = ""
     colour: Colour = BLUE
@@ -64,11 +62,6 @@ def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
 def _font(size: int) -> ImageFont.FreeTypeFont:
     """The typeface that matplotlib brings, which is the same everywhere."""
     return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)
-
-
-def _flat(points: Array) -> list[float]:
-    """Points (K, 2) as Pillow wants them: x, y, x, y, ..."""
-    return list(map(float, points.ravel()))
 
 
 class View(NamedTuple):
@@ -134,17 +127,17 @@ def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     ends = view.project(forward_kinematics(machine, scene.q).p)
     sizes = 0.03 * extent(machine)[0] * view.scale * np.linspace(1.0, 0.5, machine.n)
     for i in range(machine.n):
-        pen.line(_flat(ends[i : i + 2]), scene.colour, round(2 * float(sizes[i])))
+        pen.line(ends[i : i + 2].ravel().tolist(), scene.colour, round(2 * float(sizes[i])))
         radius = max(6.0, 0.6 * float(sizes[i]))
-        pen.polygon(_flat(ends[i] + 1.2 * radius * CIRCLE), INK)
-        pen.polygon(_flat(ends[i] + 0.5 * radius * CIRCLE), BACKGROUND)
+        pen.circle(ends[i].tolist(), 1.2 * radius, INK)
+        pen.circle(ends[i].tolist(), 0.5 * radius, BACKGROUND)
 
 
 def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     """The trail of the tool, and the arrows of its velocities."""
     tip = view.project(tool_position(forward_kinematics(machine, scene.q)))
-    pen.line(_flat(view.project(scene.trail)), scene.colour, 5)
-    pen.polygon(_flat(tip + 8 * CIRCLE), INK)
+    pen.line(view.project(scene.trail).ravel().tolist(), scene.colour, 5)
+    pen.circle(tip.tolist(), 8, INK)
     scale = 0.2 * min(view.size) / machine.tool_speed
     for v, colour in ((scene.v_tool, MEASURED), (scene.v_goal, INK)):
         along = scale * (view.axes @ v) * (1, -1)
@@ -152,14 +145,14 @@ def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
             head = min(22.0, 0.7 * length) * along / length
             barb = 0.45 * head[::-1] * (-1, 1)
             neck = tip + along - head
-            pen.line(_flat(np.array([tip, neck])), colour, 6)
-            pen.polygon(_flat(np.array([tip + along, neck + barb, neck - barb])), colour)
+            pen.line([*tip, *neck], colour, 6)
+            pen.polygon([*tip + along, *neck + barb, *neck - barb], colour)
 
 
 def _captions(pen: Pen, machine: Machine, scene: Scene, size: tuple[int, int]) -> None:
     """Title, status, the meaning of the arrows, and notes beside the rows of the joints."""
     width, height = size
-    pen.polygon(_flat((36, HEAD / 2) + 12 * CIRCLE), scene.colour)
+    pen.circle((36, HEAD / 2), 12, scene.colour)
     pen.text((60, HEAD / 2), scene.title, INK, _font(30), "lm")
     pen.text((width - 28, HEAD / 2), scene.status, MUTED, _font(26), "rm")
     for y, name, v in ((20, "goal", scene.v_goal), (52, "measured", scene.v_tool)):

@@ -57,7 +57,7 @@ def test_read_frames__reads_the_logs_of_other_tools(tmp_path, name):
 
 def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
     (tmp_path / "log.csv").write_text("(1.0) can0 123#0102\nrun,time,u_a,q_a\n")
-    refusal = r"log.csv: expected a candump log, got row 2: expected .time. bus"
+    refusal = r"log.csv: row 2: expected .time. bus"
     with pytest.raises(ValueError, match=refusal):
         list(read_frames(tmp_path / "log.csv"))
     (tmp_path / "log.csv").write_bytes(bytes(range(256)))

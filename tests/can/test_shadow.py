@@ -120,7 +120,7 @@ def test_shadow__agrees_with_somebody_who_sends_what_it_would():
     controller.act = lambda: controller.m.__setitem__(Q4, 40 * np.sin(7 * world.time))
     world, left = shadowed(controller=controller)
     world.noise.delay = 0.02
-    world.noise.command = lambda tick: world.drive.would_send
+    world.noise.command = lambda tick: world.drive.gate.sent[:, -1]
     world.run(3.0)
     assert left == [] and len(world.drive.pairs) > 50
     assert "q4: correlation +1.00, mean difference +0.0" in world.drive.report()
