@@ -135,7 +135,7 @@ def trained() -> Figures:
     result = {f"ours, {name}": value for name, value in train().items()}
     for what, new in changes.items():
         with mock.patch.object(interface, what, new):
-            result |= {f"other {what}, {name}": value for name, value in train().items()}
+            result |= {f"changed {what}, {name}": value for name, value in train().items()}
     return result
 
 
@@ -143,9 +143,9 @@ MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d9, levels)
 
 
 def main(words: list[str]) -> None:
-    """Print the entries that are named, or all; with `--train` D5 and D7."""
-    named = [entry for entry in MEASURED if entry.__name__ in words]
-    for entry in [trained] if "--train" in words else named or MEASURED:
+    """Print the entries that are named, by default all that train nothing."""
+    entries = {entry.__name__: entry for entry in MEASURED} | {"--train": trained}
+    for entry in [entries[word] for word in words] or MEASURED:
         figures = ", ".join(f"{name} {value:.4g}" for name, value in entry().items())
         print(f"{entry.__name__.upper():4} {entry.__doc__}\n     {figures}", flush=True)
 

@@ -34,7 +34,7 @@ STEPS = {
     "groups": "groups of rollouts, not a critic",
     "nets": "rich excitation, multi-step fit, five nets a joint that read what a command opens",
     "observation": "half of the history, error integral, resolved rates, open valves",
-    "command": "actions from the dead zone on, closed valves at rest",
+    "command": "actions from the dead zone on, valves wider at starts, closed at rest",
     "cost": "costs of large commands, valve travel and error integral",
     "settings": "our settings of task and learner, and Muon",
 }

@@ -84,12 +84,12 @@ def brief(value: Any, longest: int = 110) -> str:
 def expected(path: Path, what: str) -> Iterator[None]:
     """Turn any error of the block into a ValueError: `path` is not `what`.
 
-    Errors of the operating system stay as they are, and a ValueError that says what was expected
-    only gets `path` in front of it.
+    Errors of the operating system and of memory stay as they are. A ValueError that says what was
+    expected only gets `path` in front of it, if it is not there yet.
     """
     try:
         yield
-    except OSError:
+    except (OSError, MemoryError):
         raise
     except Exception as error:  # zipfile, zlib, json and NumPy raise anything on damaged files
         told = isinstance(error, ValueError) and ": expected " in str(error)

@@ -73,7 +73,11 @@ def main(options: Options) -> None:
         data.qpos[:] = trace.q[k, 0]
         mujoco.mj_forward(model, data)
         eye.update_scene(data, camera)
-        pictures.append(Image.fromarray(np.hstack([drawn, eye.render()])).quantize(64))
+        pictures.append(
+            Image.fromarray(np.hstack([drawn, eye.render()])).quantize(
+                128, Image.Quantize.FASTOCTREE
+            )
+        )
     first, *rest = pictures
     first.save(options.out, save_all=True, append_images=rest, duration=1e3 * step * M.dt, loop=0)
     print(f"{options.out}: {len(pictures)} pictures")

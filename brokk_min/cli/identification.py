@@ -133,11 +133,14 @@ class Fit(ReadsLogs):
         test = self.read_logs(self.test)[0] if self.test else None
         if test is None:
             log, test = logs.split(log)
+        else:
+            with expected(self.test[0], "a log of the same joints"):
+                test = logs.in_order(test, log.joints)
         reports = inspection.inspect(log)
         for wrong in inspection.wrong_signs(reports):
-            raise ValueError(wrong)
+            raise ValueError(f"{self.logs[0]}: {wrong}")
         net = fitting.fit(log, self.settings, self.seed, machine, known.name if known else "")
-        scores = validation.score(net, logs.in_order(test, log.joints))
+        scores = validation.score(net, test)
         warnings = validation.warnings(scores) + inspection.warnings(log, reports, known)
         save_net(self.out, net)
         if self.json:

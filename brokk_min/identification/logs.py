@@ -23,7 +23,7 @@ from brokk_min.machine import Array, Machine, require
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
 MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
-MEAN_OF = 10  # values of a command in a tick
+MEAN_OF = 10  # samples of the held command in a tick, of which the mean is taken
 LARGEST = 1e12  # of numbers in a log, assumed: any time, angle or velocity
 Rows = NDArray[np.intp]
 
@@ -167,11 +167,11 @@ def read_log(
 ) -> Log:
     """Check the table of a file, see `load_table`, and resample it at the rate of `machine`.
 
-    The command is held, and of a tick is its mean; the angle is interpolated. A gap
-    longer than `MAX_GAP` and 2.5 samples cuts a recording, and so does an angle that jumps; rows in
-    which a joint was not read count as a gap. A recording starts at rest; after a gap the rows are
-    left out whose velocity would need samples of the gap. The joints may be others than those of
-    the machine.
+    The command is held and averaged over each tick, the angle interpolated. A gap longer than
+    `MAX_GAP` and 2.5 samples cuts a recording, and so does an angle that jumps; rows in which a
+    joint was not read count as a gap. A recording starts at rest; after a gap the rows are left
+    out whose velocity would need samples of the gap. The joints may be others than those of the
+    machine.
     ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
     table = load_table(path, mapped or {}, topics)

@@ -129,15 +129,15 @@ def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     for i in range(machine.n):
         pen.line(ends[i : i + 2].ravel().tolist(), scene.colour, round(2 * float(sizes[i])))
         radius = max(6.0, 0.6 * float(sizes[i]))
-        pen.circle(ends[i].tolist(), 1.2 * radius, INK)
-        pen.circle(ends[i].tolist(), 0.5 * radius, BACKGROUND)
+        pen.regular_polygon((*ends[i], 1.2 * radius), 24, fill=INK)
+        pen.regular_polygon((*ends[i], 0.5 * radius), 24, fill=BACKGROUND)
 
 
 def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     """The trail of the tool, and the arrows of its velocities."""
     tip = view.project(tool_position(forward_kinematics(machine, scene.q)))
     pen.line(view.project(scene.trail).ravel().tolist(), scene.colour, 5)
-    pen.circle(tip.tolist(), 8, INK)
+    pen.regular_polygon((*tip, 8), 24, fill=INK)
     scale = 0.2 * min(view.size) / machine.tool_speed
     for v, colour in ((scene.v_tool, MEASURED), (scene.v_goal, INK)):
         along = scale * (view.axes @ v) * (1, -1)
@@ -152,7 +152,7 @@ def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
 def _captions(pen: Pen, machine: Machine, scene: Scene, size: tuple[int, int]) -> None:
     """Title, status, the meaning of the arrows, and notes beside the rows of the joints."""
     width, height = size
-    pen.circle((36, HEAD / 2), 12, scene.colour)
+    pen.regular_polygon((36, HEAD / 2, 12), 24, fill=scene.colour)
     pen.text((60, HEAD / 2), scene.title, INK, _font(30), "lm")
     pen.text((width - 28, HEAD / 2), scene.status, MUTED, _font(26), "rm")
     for y, name, v in ((20, "goal", scene.v_goal), (52, "measured", scene.v_tool)):
