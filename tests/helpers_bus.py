@@ -5,6 +5,7 @@ import json
 import os
 import time
 from collections import deque
+from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from helpers_machines import obedient_net
 
-from brokk_min.actuator import PLANT
+from brokk_min.actuator import AnalyticPlant
 from brokk_min.can.canopen import Frame, OperatorInput, valve_frame
 from brokk_min.can.connection import Bus, open_bus
 from brokk_min.can.simulated_machine import SimulatedMachine
@@ -77,17 +78,14 @@ def raises(error):
     return act
 
 
-class Recorder:
+class Recorder(AnalyticPlant):
     """The analytic plant; it keeps the command and the angles of each step."""
 
     def __init__(self):
         self.u, self.q = [], []
 
-    def reset(self, machine, q):
-        return PLANT.reset(machine, q)
-
     def step(self, machine, state, u):
-        state = PLANT.step(machine, state, u)
+        state = super().step(machine, state, u)
         self.u.append(u)
         self.q.append(state.q)
         return state
@@ -235,13 +233,10 @@ def own_multicast_port(monkeypatch):
     """Groups with one port are one bus: take a port of our own. Skips where nothing is routed."""
     monkeypatch.setenv("CAN_CONFIG", json.dumps({"port": 43200 + os.getpid() % 10_000}))
     bus = partial(open_bus, "udp_multicast", MULTICAST)
-    try:
-        with bus() as a, bus() as b:
-            a.send(0x123, b"")
-            if b.recv(1.0) is not None:
-                return
-    except ValueError:
-        pass
+    with suppress(ValueError), bus() as a, bus() as b:
+        a.send(0x123, b"")
+        if b.recv(1.0) is not None:
+            return
     pytest.skip("no multicast route on this machine")
 
 
@@ -257,11 +252,8 @@ class Virtual:
         folder = Path(pygame.__file__).parent.parent / "pygame.libs"
         self.sdl = ctypes.CDLL(str(next(folder.glob("libSDL2-2*"))))
         self.sdl.SDL_JoystickOpen.restype = ctypes.c_void_p
-        pointer, number = ctypes.c_void_p, ctypes.c_int
-        self.sdl.SDL_JoystickSetVirtualAxis.argtypes = [pointer, number, ctypes.c_int16]
-        self.sdl.SDL_JoystickSetVirtualButton.argtypes = [pointer, number, ctypes.c_uint8]
         self.index = self.sdl.SDL_JoystickAttachVirtual(kind, 6, buttons, 0)  # six axes
-        self.handle = self.sdl.SDL_JoystickOpen(self.index)
+        self.handle = ctypes.c_void_p(self.sdl.SDL_JoystickOpen(self.index))
 
     def axis(self, axis, value):
         assert self.sdl.SDL_JoystickSetVirtualAxis(self.handle, axis, round(32767 * value)) == 0

@@ -1,7 +1,7 @@
 """What can go wrong on a bus: causes in a `World`, words that name each, and what came of it."""
 
 import struct
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import can
@@ -17,14 +17,8 @@ STEP = BROKK_170.encoder_step[0]
 
 def put(name, value):
     """Set an attribute of the world, or of something in it."""
-
-    def cause(world):
-        *owners, attribute = name.split(".")
-        for owner in owners:
-            world = getattr(world, owner)
-        setattr(world, attribute, value)
-
-    return cause
+    *owners, attribute = name.split(".")
+    return lambda world: setattr(reduce(getattr, owners, world), attribute, value)
 
 
 def up(can_id, act):
@@ -75,21 +69,6 @@ def delay_valve_frames(world, seconds):
     world.noise = noise
 
 
-def repeat(world, period, frame):
-    """Somebody else sends `frame(1)`, `frame(2)`, ..., one each `period` [s]."""
-    begun, count = world.time, 0
-
-    def noise():
-        nonlocal count
-        out = []
-        while begun + period * (count + 1) <= world.time:
-            count += 1
-            out.append(frame(count))
-        return out
-
-    world.noise = noise
-
-
 def flood(world, foreign=False, rate=2000):
     """Frames of any identifier; pairs of identifier and length that came, and how many exist."""
     rng = np.random.default_rng(0)
@@ -97,22 +76,22 @@ def flood(world, foreign=False, rate=2000):
     known = {0, 0x80, 0x210, *(base + n for base in (0x180, 0x580, 0x600, 0x700) for n in nodes)}
     ids = rng.permutation([i for i in range(2048) if not foreign or i not in known])
     assert len(ids) % 3  # no factor in common with the nine lengths: each pair has its turn
-    seen = set()
+    begun, count, seen = world.time, 0, set()
 
-    def frame(count):
-        can_id, data = int(ids[count % len(ids)]), rng.bytes(count % 9)
-        seen.add((can_id, len(data)))
-        return can_id, data
+    def noise():
+        nonlocal count
+        out = []
+        while begun + (count + 1) / rate <= world.time:
+            count += 1
+            out.append((int(ids[count % len(ids)]), rng.bytes(count % 9)))
+        seen.update((can_id, len(data)) for can_id, data in out)
+        return out
 
-    repeat(world, 1 / rate, frame)
+    world.noise = noise
     return seen, 9 * len(ids)
 
 
 foreign_flood = partial(flood, foreign=True)
-
-
-def foreign_valves(counts, counter):
-    return 0x210, valve_frame([counts, 0, 0, 0, 0], counter % 256, 1).tobytes()
 
 
 def intruder(world, after):
@@ -125,21 +104,18 @@ def intruder(world, after):
         counter = data[5] if can_id == 0x210 else counter
         if can_id == after:
             counter += 1
-            out.append(foreign_valves(77, counter))
+            theirs = valve_frame([77, 0, 0, 0, 0], counter % 256, 1)
+            out.append((0x210, theirs.tobytes()))
             world.answers.append(out[-1])
         return out
 
     world.downward = follow
 
 
-def foreign(can_id, data):
+def foreign(world, can_id, data):
     """One frame of somebody else."""
-
-    def cause(world):
-        frames = [(can_id, data)]
-        world.noise = lambda: [frames.pop()] if frames else []
-
-    return cause
+    frames = [(can_id, data)]
+    world.noise = lambda: [frames.pop()] if frames else []
 
 
 def repeat_once(world, node):
@@ -158,12 +134,9 @@ def close_bus(world):
     world.recv = world.send = raises(can.CanOperationError("closed"))
 
 
-def stall(seconds):
-    def cause(world):
-        stalls = [seconds]
-        world.controller.act = lambda: world.sleep(stalls.pop()) if stalls else None
-
-    return cause
+def stall(world, seconds):
+    stalls = [seconds]
+    world.controller.act = lambda: world.sleep(stalls.pop()) if stalls else None
 
 
 def command(joint, value):
@@ -182,7 +155,7 @@ FAULTS = {
     "flood of 6,000 foreign frames a second": (partial(foreign_flood, rate=6e3), "bus flooded"),
     "second sender after each of our valve frames": (partial(intruder, after=0x210), ""),
     "second sender after each SYNC": (partial(intruder, after=0x080), OTHER_SENDER),
-    "foreign SYNC": (foreign(0x080, b""), OTHER_SENDER),
+    "foreign SYNC": (partial(foreign, can_id=0x080, data=b""), OTHER_SENDER),
     "bus closed": (close_bus, "error (CanOperationError: closed)"),
     "send error of all frames": (put("downward", SEND_ERROR), "(CanOperationError"),
     "valve frame lost": (valves(lambda d: []), NOT_OPERATIONAL),
@@ -195,7 +168,7 @@ FAULTS = {
     "SIGTERM": (lambda world: world.drive.signals.append(15), "stop asked for"),
     "clock stepped forward": (put("offset", 3600.0), "tick late, or the"),
     "log cannot be written": (put("bus.flush", raises(OSError("full"))), "error (OSError: full)"),
-    "late tick": (stall(0.08), "tick late"),
+    "late tick": (partial(stall, seconds=0.08), "tick late"),
     "policy returns NaN": (command(2, np.nan), "q3: no valid command"),
     "policy beyond the limit": (command(4, 81), "q5: no valid command"),
     "policy moves the locked joint": (command(1, 20), "q2: no valid command"),
@@ -217,7 +190,8 @@ for node in range(1, 6):
         of_joint["frozen"] = partial(freeze, node=node), "frozen"
     for name, (cause, words) in of_joint.items():
         FAULTS[f"q{node} {name}"] = (cause, f"q{node}: {words}")
-FAULTS["position of q5 before SYNC as well"] = (foreign(0x185, bytes(4)), f"q5: {DOUBLED}")
+cause = partial(foreign, can_id=0x185, data=bytes(4))
+FAULTS["position of q5 before SYNC as well"] = (cause, f"q5: {DOUBLED}")
 NOT_FOUND = {
     "q2 frozen, the locked joint": (partial(freeze, node=2), "it may stand still"),
     "q3 a tick late, without a gap": (partial(repeat_once, node=3), "no time, no number"),

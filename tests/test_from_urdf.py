@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pinocchio")
 from brokk_min.kinematics import forward_kinematics, tool_position
 from examples import from_urdf
 
 PROGRAM = Path(from_urdf.__file__)
-# The chassis frame lies behind the slew axis. Boom, arm and stick turn about parallel axes, the arm
-# the other way round. The tilt's axis is skew to the stick's, and the bucket's to the tilt's. The
-# gripper and the two mimics are no part of the chain.
+# The chassis frame lies behind the slew axis. Boom and arm turn about parallel axes, the arm the
+# other way round. The bucket's axis is skew to the stick's. Load and rod are no part of the chain.
 EXCAVATOR = """<robot name="test excavator">
 {links}
 <joint name="turret" type="fixed"><parent link="chassis"/><child link="turret"/>
@@ -35,10 +35,7 @@ EXCAVATOR = """<robot name="test excavator">
 <joint name="extension" type="prismatic"><parent link="arm"/><child link="stick"/>
   <origin xyz="0.9 0 0" rpy="0 0.4 0"/><axis xyz="2 0 0.5"/>
   <limit lower="0" upper="0.8" effort="1" velocity="0.2"/></joint>
-<joint name="tilt" type="revolute"><parent link="stick"/><child link="tilt"/>
-  <origin xyz="0.2 0.07 -0.1" rpy="0.1 0.2 0.3"/><axis xyz="1 0.3 -0.2"/>
-  <limit lower="-0.7" upper="0.7" effort="1" velocity="0.4"/></joint>
-<joint name="bucket" type="revolute"><parent link="tilt"/><child link="bucket"/>
+<joint name="bucket" type="revolute"><parent link="stick"/><child link="bucket"/>
   <origin xyz="0.15 0.02 0.1" rpy="0 -0.3 0.5"/><axis xyz="0.2 -0.9 0.4"/>
   <limit lower="-0.2" upper="2.0" effort="1" velocity="1.1"/></joint>
 <joint name="edge" type="fixed"><parent link="bucket"/><child link="edge"/>
@@ -52,28 +49,22 @@ LINKS = sorted({*re.findall(r'link="(\w+)"', EXCAVATOR)})
 EXCAVATOR = EXCAVATOR.format(links="".join(f'<link name="{name}"/>' for name in LINKS))
 
 
-def turn(axis, angle):
-    """Rodrigues' formula."""
-    x, y, z = np.asarray(axis) / np.linalg.norm(axis)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-
-
 def urdf_position(text, q):
     """The tool of a chain in document order; `q` by name of the joint."""
-    R, p = np.eye(3), np.zeros(3)
+    R, p = Rotation.identity(), np.zeros(3)
     for joint in ET.fromstring(text).findall("joint"):
         if (name := joint.get("name")) in q or joint.get("type") == "fixed":
             origin = joint.find("origin").attrib
-            p = p + R @ np.array(origin["xyz"].split(), float)
-            roll, pitch, yaw = map(float, origin["rpy"].split())
-            R = R @ turn([0, 0, 1], yaw) @ turn([0, 1, 0], pitch) @ turn([1, 0, 0], roll)
+            xyz, rpy = (np.array(origin[key].split(), float) for key in ("xyz", "rpy"))
+            p = p + R.apply(xyz)
+            R = R * Rotation.from_euler("xyz", rpy)  # about fixed axes
         if name in q:
             axis = np.array(joint.find("axis").get("xyz").split(), float)
+            axis *= q[name] / np.linalg.norm(axis)
             if joint.get("type") == "prismatic":
-                p = p + R @ axis / np.linalg.norm(axis) * q[name]
+                p = p + R.apply(axis)
             else:
-                R = R @ turn(axis, q[name])
+                R = R * Rotation.from_rotvec(axis)
     return p
 
 
@@ -90,10 +81,10 @@ def printed(text, tmp_path, capsys):
 def test_excavator__has_its_tool_where_the_urdf_has_it(tmp_path, capsys):
     """The boom's axis is 0.3 m out and 1.3 m high, and the arm is 0.05 m right of the slew axis."""
     machine, told = printed(EXCAVATOR, tmp_path, capsys)
-    assert machine.names == ("slew", "boom", "arm", "extension", "tilt", "bucket")
+    assert machine.names == ("slew", "boom", "arm", "extension", "bucket")
     assert [joint.kind for joint in machine.joints].index("prismatic") == 3
-    assert machine.column("q_min").round(4).tolist() == [-3.1416, -1.1, -2.5, 0.0, -0.7, -0.2]
-    assert machine.column("q_dot_down").tolist() == [0.3, 0.5, 0.6, 0.2, 0.4, 1.1]
+    assert machine.column("q_min").round(4).tolist() == [-3.1416, -1.1, -2.5, 0.0, -0.2]
+    assert machine.column("q_dot_down").tolist() == [0.3, 0.5, 0.6, 0.2, 1.1]
     assert told.count("warning: ") == told.count("warning: slew: the ") == 2  # range and speed
     assert float(told.split("at most ")[1].split()[0]) < 1e-9
     slew, boom, *_ = machine.joints
@@ -107,23 +98,17 @@ def test_excavator__has_its_tool_where_the_urdf_has_it(tmp_path, capsys):
     np.testing.assert_allclose(tools, theirs, atol=1e-9)
 
 
-AXES = ["1 0 0", "0 1 0", "0 0 1", "0 -1 0", "1 1 0", "0.2 -0.3 0.9"]
-PLACES = ["0 0 0", "1 0 0", "0 0 0.5", "0.4 -0.3 0.2"]
-TURNS = ["0 0 0", "1.5707963267948966 0 0", "0 -1.5707963267948966 0.4", "0.3 0.5 -0.7"]
+CHOICES = {
+    "kind": ["revolute", "revolute", "prismatic"],
+    "axis": ["1 0 0", "0 1 0", "0 0 1", "0 -1 0", "1 1 0", "0.2 -0.3 0.9"],
+    "place": ["0 0 0", "1 0 0", "0 0 0.5", "0.4 -0.3 0.2"],
+    "turn": ["0 0 0", "1.5707963267948966 0 0", "0 -1.5707963267948966 0.4", "0.3 0.5 -0.7"],
+}
 JOINT = """<joint name="j{i}" type="{kind}"><parent link="l{i}"/><child link="l{next}"/>
   <origin xyz="{place}" rpy="{turn}"/><axis xyz="{axis}"/>
   <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
-CHAINS = st.lists(
-    st.builds(
-        dict,
-        kind=st.sampled_from(["revolute", "revolute", "prismatic"]),
-        axis=st.sampled_from(AXES),
-        place=st.sampled_from(PLACES),
-        turn=st.sampled_from(TURNS),
-    ),
-    min_size=1,
-    max_size=5,
-)
+JOINTS = st.fixed_dictionaries({key: st.sampled_from(values) for key, values in CHOICES.items()})
+CHAINS = st.lists(JOINTS, min_size=1, max_size=5)
 
 
 def chain_of(joints):
@@ -146,7 +131,6 @@ def test_any_chain__has_its_tool_where_the_urdf_has_it(tmp_path_factory, joints)
     tools = tool_position(forward_kinematics(machine, q)) + from_urdf.base_origin(chain)
     theirs = [urdf_position(text, dict(zip(machine.names, pose))) for pose in q]
     np.testing.assert_allclose(tools, theirs, atol=1e-9)
-    assert from_urdf.largest_difference(chain, machine) < 1e-9
 
 
 def test_rounded_right_angles__count_as_parallel(tmp_path, capsys):

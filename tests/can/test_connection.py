@@ -6,9 +6,11 @@ import re
 import select
 import threading
 import time
+from types import SimpleNamespace
 
 import can
 import pytest
+from helpers_bus import raises
 
 from brokk_min.can.canopen import Frame
 from brokk_min.can.connection import Bus, open_bus
@@ -49,38 +51,29 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
 
 def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
     """An adapter that was pulled out fails at the shutdown, too."""
-
-    def fails():
-        raise can.CanOperationError("gone")
-
     refusal = r"virtual v: expected a CAN bus that works, got gone$"
     with pytest.raises(ValueError, match=refusal), open_bus("virtual", "v", tmp_path / "l") as bus:
         bus.send(0x080, b"")
-        bus.bus.shutdown, shutdown = fails, bus.bus.shutdown
+        bus.bus.shutdown, shutdown = raises(can.CanOperationError("gone")), bus.bus.shutdown
     shutdown()
     assert (tmp_path / "l").read_text().endswith(" v 080# T\n")
 
 
-class Piped:
-    """A bus of python-can with a descriptor; one frame comes with the byte of a pipe."""
+def test_recv__waits_for_the_descriptor_by_its_own_clock():
+    """A frame comes with the byte of a pipe."""
+    reader, writer = os.pipe()
 
-    def __init__(self):
-        self.reader, self.writer = os.pipe()
-
-    def recv(self, timeout):
+    def recv(timeout):
         assert timeout == 0.0  # else python-can would wait by the time of day
-        if not select.select([self.reader], [], [], 0)[0]:
+        if not select.select([reader], [], [], 0)[0]:
             return None
-        os.read(self.reader, 1)
+        os.read(reader, 1)
         return can.Message(arbitration_id=0x181, data=b"1234", is_extended_id=False)
 
-
-def test_recv__waits_for_the_descriptor_by_its_own_clock():
-    raw = Piped()
-    bus = Bus(raw, file=raw.reader)
+    bus = Bus(SimpleNamespace(recv=recv), file=reader)
     start = time.monotonic()
     assert bus.recv(0.05) is None and 0.05 <= time.monotonic() - start < 1.0
-    threading.Timer(0.02, os.write, (raw.writer, b"x")).start()
+    threading.Timer(0.02, os.write, (writer, b"x")).start()
     frame = bus.recv(5.0)
     assert (frame.id, frame.data) == (0x181, b"1234") and time.monotonic() - start < 2.0
-    os.close(raw.reader), os.close(raw.writer)
+    os.close(reader), os.close(writer)

@@ -3,7 +3,6 @@
 import cantools
 import numpy as np
 
-from brokk_min.can import canopen
 from brokk_min.can.canopen import encoder_raw, node_numbers, valve_frame
 from brokk_min.machine import BROKK_170
 from examples.dbc import dbc
@@ -22,5 +21,4 @@ def test_dbc__describes_the_frames_that_the_program_uses():
     assert decoded == commands | {"counter": 7, "enable": 1}
     raw = int(encoder_raw(BROKK_170, np.full(5, -5))[1])
     assert database.decode_message(0x182, raw.to_bytes(4, "little")) == {"position": raw}
-    heartbeat = canopen.HEARTBEAT + controller
-    assert database.decode_message(heartbeat, b"\x05") == {"state": 5}
+    assert database.decode_message(0x700 + controller, b"\x05") == {"state": 5}

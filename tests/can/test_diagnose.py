@@ -13,22 +13,18 @@ from brokk_min.machine import read_encoder
 from examples.diagnose import diagnose
 
 START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
-
-
 POLICIES = {name: random_policy(name) for name in ("paper", "beyond")}
 
 
-def drive(observe=lambda h: h, send=lambda u: u, read=lambda q: q, ticks_of_plant=1, name="paper"):
-    """A drive with a fault: in what the policy gets, the valves get, or the encoders give."""
+def drive(observe=lambda h: h, send=lambda u: u, ticks_of_plant=1, name="paper"):
+    """A drive with a fault: in what the policy gets, or the valves."""
     policy = POLICIES[name]
     goals = np.concatenate([sequence.goals[20:120] for sequence in axis_sequences(M)])
-    state, memory, history, u, ticks = policy.net.reset(M, START), None, None, np.zeros((1, 5)), []
+    state, memory, u, ticks = policy.net.reset(M, START), None, np.zeros((1, 5)), []
+    history = initial_history(np.float32(read_encoder(M, START)), M.history)
     for t, goal in enumerate(goals):
-        q = read_encoder(M, read(state.q))
-        if history is None:
-            history = initial_history(q.astype(np.float32), M.history)
-        else:
-            history = append_sample(history, u, q, M.velocity_samples, M.dt)
+        q = read_encoder(M, state.q)
+        history = append_sample(history, u, q, M.velocity_samples, M.dt)
         v_goal = goal[None].astype(np.float32)
         u, memory = policy(measure(M, observe(history.copy()), v_goal), memory)
         time = t * ticks_of_plant / 20

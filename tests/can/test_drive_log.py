@@ -22,20 +22,16 @@ def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):
         assert times == [1.0, 2.0][: text[:size].count("\n")]
 
 
-def test_read_frames__reads_a_plain_candump_log_too(tmp_path):
+def test_read_frames__reads_what_candump_logs_and_what_it_prints_on_a_terminal(tmp_path):
     """Without extended, FD and remote frames, and those of a length code above eight."""
     others = "".join(f"(2.0) can0 {frame}\n" for frame in OTHER_FRAMES)
     (tmp_path / "can.log").write_text(f"(1.0) can0 123#0102\n{others}(3.0) can0 080# T\n")
-    found = list(read_frames(tmp_path / "can.log"))
-    assert found == [Frame(1.0, 0x123, b"\x01\x02"), Frame(3.0, 0x80, b"", True)]
-
-
-def test_read_frames__reads_what_candump_prints_on_a_terminal(tmp_path):
-    text = " (1.000000)  can0  123   [2]  01 02\n (2.000000)  can0  080   [0]  \n"
-    fd = " (3.000000)  can0  123  [12]  " + "00 " * 12 + "\n"
-    (tmp_path / "terminal.txt").write_text(text + fd)
-    found = list(read_frames(tmp_path / "terminal.txt"))
-    assert found == [Frame(1.0, 0x123, b"\x01\x02"), Frame(2.0, 0x80, b"")]
+    fd = " (2.000000)  can0  123  [12]  " + "00 " * 12 + "\n"
+    printed = f" (1.000000)  can0  123   [2]  01 02\n{fd} (3.000000)  can0  080   [0]  \n"
+    (tmp_path / "terminal.txt").write_text(printed)
+    for name, sent in (("can.log", True), ("terminal.txt", False)):
+        expected = [Frame(1.0, 0x123, b"\x01\x02"), Frame(3.0, 0x80, b"", sent)]
+        assert list(read_frames(tmp_path / name)) == expected
 
 
 @pytest.mark.parametrize("name", ["drive.asc", "drive.blf", "drive.trc", "drive.log.gz"])
@@ -65,10 +61,6 @@ def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
         list(read_frames(tmp_path / "log.csv"))
 
 
-def replace_data(frame, counts):
-    return frame._replace(data=struct.pack("<I", counts))
-
-
 def test_log_for_fit__by_hand():
     """Ticks are missing; a foreign frame and a cut one change nothing; 14 ticks are too few."""
     machine = replace(BROKK_170, rate=10.0)
@@ -77,8 +69,7 @@ def test_log_for_fit__by_hand():
     for k in (k for part in parts for k in part):
         t = 100 + k / 10
         frames.append(Frame(t, 0x080, b"", True))
-        for node in range(1, 6):
-            frames.append(Frame(t, 0x180 + node, struct.pack("<I", 100 * node + k)))
+        frames += [Frame(t, 0x180 + n, struct.pack("<I", 100 * n + k)) for n in range(1, 6)]
         frames.append(Frame(t, 0x555, b"\x01" * 8))
         frames.append(Frame(t, 0x210, valve_frame([80, 0, -80, 1, 0], k, 1).tobytes(), True))
         frames.append(Frame(t, 0x210, b"\x01" * 7, True))
@@ -91,7 +82,8 @@ def test_log_for_fit__by_hand():
         np.testing.assert_allclose(recording.u * 127, len(ticks) * [[80, 0, -80, 1, 0]], atol=1e-9)
     q = [k for k, frame in enumerate(frames) if frame.id == 0x181]
     unread = frames.copy()
-    unread[q[0]], unread[q[18]] = (replace_data(frames[q[k]], 3000) for k in (0, 18))
+    for k in (0, 18):
+        unread[q[k]] = frames[q[k]]._replace(data=struct.pack("<I", 3000))
     log = log_for_fit(machine, unread)  # 16 ticks after the second one, 14 before it
     assert [len(recording.q) for recording in log.recordings] == [16]
     np.testing.assert_allclose(log.recordings[0].q[0], (np.arange(100, 600, 100) + 20) * STEP)
@@ -103,10 +95,9 @@ def test_log_for_fit__by_hand():
 def test_read_telemetry__gives_at_each_sync_the_tick_before():
     goal = OperatorInput((0.1, 0.0, -0.2), enable=True).pack()
     q = np.array([0.0, 0.5, 0.6, 1.7, 1.2])
-    frames, measured = [], []
+    frames = []
     for k in range(6):
         counts = np.rint((q + 0.01 * k) / STEP).astype(int)
-        measured.append(counts * STEP)
         frames.append(Frame(0.05 * k, 0x080, b""))
         for node, raw in enumerate(encoder_raw(BROKK_170, counts).tolist(), 1):
             frames.append(Frame(0.0, 0x180 + node, struct.pack("<I", raw)))
@@ -116,7 +107,7 @@ def test_read_telemetry__gives_at_each_sync_the_tick_before():
     frames += [Frame(0.3, 0x080, b""), Frame(0.35, 0x181, struct.pack("<I", 3))]  # a gap
     *_, before, last, gap = read_telemetry(BROKK_170, [*frames, Frame(0.4, 0x080, b"")])
     assert before.driving and last.driving and before.time == 0.2
-    np.testing.assert_array_equal(before.q, measured[4])
+    np.testing.assert_array_equal(before.q, np.rint((q + 0.04) / STEP) * STEP)
     np.testing.assert_allclose(before.u * 127, [50, 0, -80, 0, 0])
     np.testing.assert_allclose(before.v_goal, [0.1, 0.0, -0.2])
     assert not gap.driving and not gap.v_goal.any()

@@ -1,4 +1,4 @@
-"""The gate against a plain rewriting of its promises, and its promises over sequences."""
+"""The gate against a plain rewriting of its promises."""
 
 from dataclasses import replace
 
@@ -7,11 +7,10 @@ import pytest
 
 from brokk_min.can.canopen import checksum
 from brokk_min.can.safety_gate import GateInputs, GateState, expected_motion, gate, gate_start
-from brokk_min.machine import BROKK_170, decode_pwm
+from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
 DT = 0.05
-DRIVEN = np.array([joint.driven for joint in BROKK_170.joints])
 
 
 def test_expected_motion__counts_from_one_and_a_half_of_the_machines_widest_dead_zone():
@@ -40,10 +39,8 @@ def tight_machine():
 
     margins = [(-0.05, 0.05), (-0.05, 0.05), (0.02, -0.02), (-0.05, -0.02), (0.02, 0.05)]
     joints = tuple(
-        replace(
-            joint, q_min=edge(joint.q_min, low), q_max=edge(joint.q_max, high), cylinder_base=0.0
-        )
-        for joint, (low, high) in zip(BROKK_170.joints, margins, strict=True)
+        replace(j, q_min=edge(j.q_min, low), q_max=edge(j.q_max, high), cylinder_base=0.0)
+        for j, (low, high) in zip(BROKK_170.joints, margins, strict=True)
     )
     return replace(BROKK_170, name="tight", joints=joints)
 
@@ -119,10 +116,6 @@ def plain_gate(machine, s, i, now):
     return state, [*(x if x >= 0 else 255 + x for x in m), counter, int(driving)]
 
 
-def row(value, k):
-    return [np.asarray(field)[k] for field in value]
-
-
 # --- cases that lie on the borders ---------------------------------------------------------------
 
 
@@ -132,12 +125,9 @@ class Cases:
     def __init__(self, machine, num, seed):
         self.machine, self.num, self.rng = machine, num, np.random.default_rng(seed)
         self.inputs = self.draw_inputs()
-        self.now = np.zeros(num)
         self.state = self.draw_state()
-        self.expected = [
-            plain_gate(machine, GateState(*row(self.state, k)), GateInputs(*row(self.inputs, k)), 0)
-            for k in range(num)
-        ]
+        rows = zip(zip(*self.state), zip(*self.inputs))
+        self.expected = [plain_gate(machine, GateState(*s), GateInputs(*i), 0) for s, i in rows]
 
     def some(self, p, *shape):
         return self.rng.random((self.num, *shape)) < p
@@ -158,7 +148,7 @@ class Cases:
         m[:, self.machine.locked] = 0
         heartbeat = -rng.uniform(0, 0.1, (num, n + 1))
         return GateInputs(
-            command=self.put(m, 0.01, np.nan, np.inf, -np.inf, 81, -81, 80.5, 1, -1),
+            command=self.put(m, 0.01, np.nan, np.inf, -np.inf, 1e300, 81, -81, 80.5, 1, -1),
             counts=np.where(self.some(0.3, n), near, middle).astype(int),
             frames=self.put(np.ones((num, n), int), 0.01, 0, 2, 3),
             heartbeat=self.put(heartbeat, 0.01, -0.110, -0.110 - 1e-9, -np.inf, 0.049, 1.0, np.nan),
@@ -180,9 +170,8 @@ class Cases:
         last = self.inputs.counts - np.where(self.some(0.03, n), jump, step)
         # commands: to one side for some ticks, or not; now and then one to the other side
         odds = [0.01, 0.3, 0.19, 0.3, 0.2]
-        push = rng.choice([-1, 1], (num, n, 1)) * rng.choice(
-            [12, 13, 14, 40, 80], (num, n, 9), p=odds
-        )
+        sides = rng.choice([-1, 1], (num, n, 1))
+        push = sides * rng.choice([12, 13, 14, 40, 80], (num, n, 9), p=odds)
         pushed = np.arange(9, 0, -1) <= rng.choice([0, 7, 8, 9], (num, n, 1))
         sent = np.where(pushed, push, rng.integers(-80, 81, (num, n, 9)))
         late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, np.nan, -1.0)
@@ -209,7 +198,7 @@ def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
             type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))
             for part in (cases.state, cases.inputs)
         ]
-        state, frame = gate(machine, *given, cases.now.reshape(shape))
+        state, frame = gate(machine, *given, np.zeros(shape))
         assert frame.dtype == np.uint8 and frame.shape == (*shape, 8)
         frame = frame.reshape(3000, 8)
         np.testing.assert_array_equal(np.delete(frame, 6, axis=1), [f for _, f in cases.expected])
@@ -221,32 +210,3 @@ def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
     faults = {s.active_fault // 6 for s, _ in cases.expected}
     assert faults == set(range(16)), "each fault comes up"
     assert sum(bool(s.driving and any(f[:5])) for s, f in cases.expected) > 300
-
-
-def test_gate__never_raises_and_closes_the_valves_on_nonsense():
-    rng = np.random.default_rng(4)
-    values = {
-        float: [np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, -1.0, 5e-324],
-        int: [0, -1, 2**62, -(2**62), 2**31, 255, 128],
-        bool: [True, False],
-    }
-    cases = Cases(BROKK_170, 2000, 6)
-    inputs = cases.inputs
-
-    def spoil(field):
-        chosen = rng.choice(np.array(values[field.dtype.type(0).item().__class__]), field.shape)
-        return np.where(rng.random(field.shape) < 0.05, chosen.astype(field.dtype), field)
-
-    for _ in range(20):
-        inputs = GateInputs(*map(spoil, inputs))
-        state = GateState(*map(spoil, cases.state))
-        state = state._replace(counter=rng.integers(0, 256, 2000), sent=cases.state.sent)
-        with np.errstate(all="ignore"):
-            frame = gate(BROKK_170, state, inputs, spoil(cases.now))[1]
-        assert frame.dtype == np.uint8 and frame.shape == (2000, 8)
-        m = np.rint(decode_pwm(frame[:, :5]) * 127)
-        assert (np.abs(m) <= 80 * DRIVEN).all()
-        assert not m[frame[:, 7] == 0].any()
-        assert set(np.unique(frame[:, 7])) <= {0, 1}
-        sound = np.isfinite(inputs.command).all(1) & (inputs.frames == 1).all(1)
-        assert not (frame[:, 7] == 1)[~(sound & (inputs.nmt == 5).all(1))].any()

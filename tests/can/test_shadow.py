@@ -17,6 +17,7 @@ from brokk_min.cli.operating import status
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
+POLICY = load_policy(SHIPPED / BROKK_170.name / POLICIES["rl"], BROKK_170)
 Q4 = 3
 
 
@@ -25,15 +26,11 @@ def to_and_fro(joint, tick):
     return 40 * ((tick > 20) - 2 * (tick > 50) + (tick > 90)) * (np.arange(5) == joint)
 
 
-def shadowed(
-    machine=BROKK_170, controller=None, operator=None, log=None, sync=False, period=0.05, moved=Q4
-):
+def shadowed(machine=BROKK_170, controller=None, operator=None, log=None, sync=False, period=0.05):
     """A world with a remote control and a shadow, and the frames that leave the shadow."""
-    if controller is None:
-        path = SHIPPED / BROKK_170.name / POLICIES["rl"]
-        controller = load_policy(path, BROKK_170)
+    controller = controller or ConstantCommand(0, 0, 0, 10, 0)
     world, left = World(controller, operator, log=log), []
-    world.noise = RemoteControl(world, partial(to_and_fro, moved), period)
+    world.noise = RemoteControl(world, partial(to_and_fro, Q4), period)
     world.downward = lambda can_id, data: left.append((can_id, data)) or [(can_id, data)]
     world.drive = Shadow(machine, controller, world.bus, operator, sync)
     world.drive.begin()
@@ -46,7 +43,7 @@ def correlation(drive, joint=Q4):
 
 
 def test_shadow__compares_and_logs_what_it_would_send_and_sends_nothing(tmp_path):
-    world, left = shadowed(log=tmp_path / "run.log")
+    world, left = shadowed(controller=POLICY, log=tmp_path / "run.log")
     world.run(6.0)
     world.bus.close()
     drive = world.drive
@@ -78,13 +75,14 @@ def test_shadow__tells_an_encoder_of_the_wrong_sign(j):
     zero = round(2 * START[j] * 4096 / 6.283)
     wrong = replace(BROKK_170.joints[j], encoder_sign=-1, encoder_zero=zero)
     joints = (*BROKK_170.joints[:j], wrong, *BROKK_170.joints[j + 1 :])
-    world, left = shadowed(replace(BROKK_170, joints=joints), moved=j)
+    world, left = shadowed(replace(BROKK_170, joints=joints), POLICY)
+    world.noise.command = partial(to_and_fro, j)
     world.run(6.0)
     assert left == [] and correlation(world.drive, j) < -0.5
 
 
 def test_report__by_hand():
-    world, _ = shadowed(controller=ConstantCommand(0, 0, 0, 10, 0))
+    world, _ = shadowed()
     world.drive.pairs = [
         (np.array([0, 0, 0, m, 5]), np.array([0, 0, 9, n, 5])) for m, n in ((1, 4), (2, 2), (3, 3))
     ]
@@ -105,7 +103,7 @@ def test_report__by_hand():
 @pytest.mark.parametrize("period", [0.01, 0.025, 0.05])
 def test_shadow__follows_the_positions_that_somebody_else_asks_for(period):
     """Without heartbeats, too: nobody has set them up."""
-    world, left = shadowed(controller=ConstantCommand(0, 0, 0, 10, 0), period=period)
+    world, left = shadowed(period=period)
     world.noise.command = lambda tick: np.zeros(5)
     world.upward = lambda can_id, data: [(can_id, data)] * (can_id < 0x700)
     world.run(4.0)
@@ -129,7 +127,7 @@ def test_shadow__agrees_with_somebody_who_sends_what_it_would():
 
 
 def test_shadow__finds_the_faults_of_the_gate_and_goes_on():
-    world, left = shadowed(controller=ConstantCommand(0, 0, 0, 10, 0))
+    world, left = shadowed()
     world.run(1.5)
     assert world.drive.history[0, Q4, 2, -1] * 127 == pytest.approx(40)  # what was sent
     compared = len(world.drive.pairs)
@@ -145,15 +143,11 @@ def test_shadow__finds_the_faults_of_the_gate_and_goes_on():
 
 
 def test_shadow__sends_sync_and_starts_nodes_if_it_is_asked_to():
-    operator = HoldingOperator()
-    operator.v = (0.0, 0.1, 0.0)
-    world, left = shadowed(
-        controller=ConstantCommand(0, 0, 0, 10, 0), operator=operator, sync=True, period=None
-    )
+    world, left = shadowed(operator=HoldingOperator(), sync=True, period=None)
     world.run(2.0)
     assert {can_id for can_id, _ in left} == {0x000, 0x080}
     assert left[0] == (0x000, b"\x01\x00") and len(left) == pytest.approx(41, abs=2)
-    assert len(world.drive.pairs) > 30 and world.drive.operator_input.v_goal == (0.0, 0.1, 0.0)
+    assert len(world.drive.pairs) > 30 and world.drive.operator_input.v_goal == (0.1, 0.0, 0.0)
 
 
 def test_drive_shadow__sends_nothing_until_it_gives_up(tmp_path, capsys, monkeypatch):

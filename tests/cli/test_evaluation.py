@@ -36,7 +36,7 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
         printed = capsys.readouterr().out
         assert "means over 1 sequences from 1 starts" in printed
         assert f"{'strongest PID':26}{'closed':>15}{errors[plant][-1]:15.4g}" in printed
-    assert len({row[1] for row in errors.values()}) == 3
+    assert len({tuple(row) for row in errors.values()}) == 3
     assert evaluate(folder, f"--json {out}") == 2  # it is there
 
 

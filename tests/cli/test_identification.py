@@ -54,7 +54,6 @@ def test_fit__takes_a_foreign_log_and_beats_persistence(tmp_path, capsys):
     assert (meta["machine"], meta["logs"], meta["test"]) == ("", [str(log)], [str(test)])
     for joint in written["joints"].values():
         assert joint["one_step_rmse"] < joint["persistence_rmse"]
-        assert set(joint["free_run"]) == {"1", "5", "10"}  # 25 s recordings hold no 30 s run
     assert run("inspect", test, "--net", tmp_path / "n.npz", "--json", tmp_path / "i.json") == 0
     report = json.loads((tmp_path / "i.json").read_text())
     assert report["scores"] == written["joints"]

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from helpers_bus import raises
 from helpers_cli import run
 
 import brokk_min
@@ -71,10 +72,8 @@ def test_version__is_that_of_the_project_and_of_its_citation(capsys):
 
 
 def test_ctrl_c__ends_a_command_in_one_line(monkeypatch, capsys):
-    def interrupt(self):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("brokk_min.cli.identification.Collect.__call__", interrupt)
+    collect = "brokk_min.cli.identification.Collect.__call__"
+    monkeypatch.setattr(collect, raises(KeyboardInterrupt))
     assert run("collect --out x.csv") == 1
     assert capsys.readouterr().err == "brokk-min: stopped\n"
 

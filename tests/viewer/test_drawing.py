@@ -16,9 +16,8 @@ SIZE = (960, 600)
 STRETCHED = np.array([0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])  # all links of the Brokk are level
 
 
-def scene(q=Q, **more):
-    still = np.zeros(len(q))
-    return Scene(q, still, np.zeros(3), np.zeros(3))._replace(**more)
+def scene(**more):
+    return Scene(Q, np.zeros(5), np.zeros(3), np.zeros(3))._replace(**more)
 
 
 def tool(q):

@@ -1,5 +1,7 @@
 """The window without a display: keys and gamepad become goals, and a simulated machine follows."""
 
+from collections import Counter
+
 import numpy as np
 import pygame
 import pytest
@@ -21,12 +23,7 @@ JOG = JointJog(BROKK_170, "q1", 12)
 def held(monkeypatch):
     """Names of the keys that are held."""
     names = set()
-
-    class Pressed:
-        def __getitem__(self, code):
-            return pygame.key.name(code) in names
-
-    monkeypatch.setattr(pygame.key, "get_pressed", Pressed)
+    monkeypatch.setattr(pygame.key, "get_pressed", lambda: Counter(map(pygame.key.key_code, names)))
     return names
 
 
@@ -49,9 +46,7 @@ def look(operator):
 @pytest.mark.parametrize(
     ("keys", "goal"),
     [
-        ("", (0, 0, 0)),
-        ("up", (0.3, 0, 0)),
-        ("left", (0, 0.3, 0)),
+        ("right", (0, -0.3, 0)),
         ("w", (0, 0, 0.3)),
         ("up,left", (0.3 * 0.5**0.5, 0.3 * 0.5**0.5, 0)),
         ("w,s", (0, 0, 0)),
@@ -88,7 +83,6 @@ def test_session__follows_the_goal_with_each_of_its_controllers():
     np.testing.assert_allclose(session.trail[0], first)
     scene = session.scene()
     np.testing.assert_array_equal(scene.q, session.state.q[0])
-    np.testing.assert_array_equal(scene.u, session.state.history[0, :, 2, -1])
     assert (scene.title, scene.status, scene.colour) == ("PID", "3.0 s", drawing.BLUE)
     session.switch()
     assert (session.scene().title, session.scene().colour) == ("jog", drawing.ORANGE)

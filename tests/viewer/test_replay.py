@@ -29,9 +29,8 @@ def test_scenes__are_the_drive_from_its_first_driven_tick(log):
     q = np.array(world.recorder.q)  # each 5 ms
     for scene in shown[::10]:
         assert np.abs(q - scene.q).max(axis=1).min() < 2e-3  # an encoder's count is 1.5 mrad
-    np.testing.assert_allclose(
-        [scene.v_goal for scene in shown[2:]], len(shown[2:]) * [[0.1, 0, 0]]
-    )
+    goals = [scene.v_goal for scene in shown[2:]]
+    np.testing.assert_allclose(goals, len(goals) * [[0.1, 0, 0]])
     np.testing.assert_allclose(shown[-1].v_tool, [0.1, 0, 0], atol=0.05)
     fk = forward_kinematics(BROKK_170, np.array([scene.q for scene in shown]))
     np.testing.assert_allclose(shown[-1].trail, tool_position(fk))
