@@ -84,12 +84,9 @@ def test_plot_errors__has_a_row_with_an_interval_for_each_controller():
     errors = {"rl": {"mean": 2.0, "low": 1.0, "high": 3.0}}
     errors["pid_by_hand"] = {"mean": 5.0, "low": 4.0, "high": 6.0}
     (ax,) = figures.plot_errors(errors).axes
-    assert [text.get_text() for text in ax.get_yticklabels()] == [
-        "PPO, our interface",
-        "PID by hand",
-    ]
-    (container,) = ax.containers
-    (mean, _, (bars,)) = container
+    labels = [text.get_text() for text in ax.get_yticklabels()]
+    assert labels == ["PPO, our interface", "PID by hand"]
+    ((mean, _, (bars,)),) = ax.containers
     assert np.array(mean.get_data()).tolist() == [[2, 5], [0, 1]]
     ends = [segment[:, 0].tolist() for segment in bars.get_segments()]
     assert ends == [[1, 3], [4, 6]]

@@ -14,25 +14,17 @@ from brokk_min.machine import BROKK_170
 @pytest.mark.parametrize(
     ("goals", "p_tool", "expected"),
     [
-        (  # along x; the stop and the motion back keep the line
+        (
             [[0.2, 0, 0], [0.2, 0, 0], [0, 0, 0], [-0.1, 0, 0]],
             [[1.0, 0, 0], [2.0, 0.3, 0.4], [2.0, 0.3, 0.0], [1.0, 0.0, 0.1]],
             [0.0, 0.5, 0.3, 0.1],
         ),
-        (  # a second line through (1, 0.1) along y
-            [[0.2, 0, 0], [0, 0.2, 0]],
-            [[1.0, 0.1, 0], [1.2, 5.0, 0]],
-            [0.1, 0.2],
-        ),
-        (  # before the first motion from the start
-            [[0.0, 0, 0], [0, 0, 0.1]],
-            [[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]],
-            [0.5, 0.1],
-        ),
+        ([[0.2, 0, 0], [0, 0.2, 0]], [[1.0, 0.1, 0], [1.2, 5.0, 0]], [0.1, 0.2]),
+        ([[0.0, 0, 0], [0, 0, 0.1]], [[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]], [0.5, 0.1]),
     ],
-    ids=["line", "turn", "rest"],
 )
 def test_line_distance__by_hand(goals, p_tool, expected):
+    """A stop and the way back keep a line, a turn begins another; before, it is the start."""
     result = m.line_distance(np.array(p_tool)[:, None], np.array(goals)[:, None], np.zeros((1, 3)))
     assert result[:, 0] == pytest.approx(expected)
 
@@ -116,12 +108,8 @@ def test_mean_interval__of_one_value_or_equal_ones():
 
 
 def test_means__are_over_starts_of_the_means_of_their_runs():
-    errors = {"x": [1.0, 3.0], "y": [2.0, 6.0]}
-    runs = [
-        {"controller": "a", "sequence": s, "start": i, "kind": "workspace", "error": e}
-        for s, of in errors.items()
-        for i, e in enumerate(of)
-    ]
+    rows = [("x", 0, 1.0), ("x", 1, 3.0), ("y", 0, 2.0), ("y", 1, 6.0)]
+    runs = [{"controller": "a", "sequence": s, "start": i, "error": e} for s, i, e in rows]
     result = m.means(runs)["a"]
     assert {s: result[s]["error"]["mean"] for s in result} == {"x": 2.0, "y": 4.0, "all": 3.0}
     assert result["all"]["error"] == m.mean_interval(np.array([1.5, 4.5]))

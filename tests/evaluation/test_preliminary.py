@@ -1,10 +1,11 @@
 """Preliminary tests and the sim-to-real gap, by hand, on the plant, and on any machine."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers_bus import Recorder
 from helpers_machines import small_net
 
 from brokk_min.actuator import PLANT
@@ -17,10 +18,6 @@ LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
 COARSE = replace(BROKK_170, plant_dt=0.025)  # two Euler steps a tick: fast
 
 
-class Angles(NamedTuple):
-    q: np.ndarray
-
-
 class TwoSpeeds:
     """Joints that move at one speed in each direction, whatever the command; keeps its inputs."""
 
@@ -31,26 +28,12 @@ class TwoSpeeds:
     def reset(self, machine, q):
         self.starts.append(q)
         self.commands.append([])
-        return Angles(q)
+        return SimpleNamespace(q=q)
 
     def step(self, machine, state, u):
         self.commands[-1].append(u)
         speed = np.where(u > 0, self.up, np.where(u < 0, -self.down, 0.0))
-        return Angles(state.q + speed * machine.dt)
-
-
-@pytest.fixture(scope="module")
-def of_plant():
-    return preliminary.preliminary_tests(BROKK_170, PLANT)
-
-
-def test_sweeps__go_from_stop_to_stop_at_the_papers_speeds(of_plant):
-    for command, end, peak in (("u = 80", HIGH, 0.24), ("u = 175", LOW, -0.45)):
-        q, q_dot = of_plant.sweeps[command]
-        assert q[-1] == end[4] and q_dot[-1] != 0
-        assert np.all(q_dot * peak >= 0)
-        assert np.abs(q_dot).max() == pytest.approx(abs(peak), rel=0.04)
-        np.testing.assert_allclose(np.diff(q) * 20, q_dot[1:], atol=1e-9)
+        return SimpleNamespace(q=state.q + speed * machine.dt)
 
 
 def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
@@ -75,50 +58,32 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     np.testing.assert_allclose(steps, [[0, (80 / 127 + 0.07) / 2], [80 / 127] * 2])
 
 
-@pytest.mark.parametrize(
-    ("velocity", "expected"),  # six ticks, of which three are after the step
-    [
-        # 63 % is reached between the middles of the first two ticks after the step
-        ([0, 0, 0, 0.05, 0.09, 0.1], 0.05 * (0.5 + (0.063 - 0.05) / 0.04)),
-        ([0, 0, 0, 0.1, 0.1, 0.1], 0.05 * (0.63 - 0.5)),  # at once, between two middles
-        ([0.1] * 6, None),
-    ],
-)
-def test_response_time__by_hand(velocity, expected):
-    time = 0.05 * (np.arange(6) - 2.5)
-    found = preliminary.response_time(time, np.array(velocity))
-    assert found == (expected and pytest.approx(expected))
-
-
-def test_preliminary_tests__of_the_plant_have_the_papers_response_times(of_plant):
-    times = {n: preliminary.response_time(*of) for n, of in of_plant.past_movement.items()}
+def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
+    """And the sweeps go from stop to stop at the paper's speeds."""
+    tests = preliminary.preliminary_tests(BROKK_170, PLANT)
+    for command, end, peak in (("u = 80", HIGH, 0.24), ("u = 175", LOW, -0.45)):
+        q, q_dot = tests.sweeps[command]
+        assert q[-1] == end[4] and q_dot[-1] != 0
+        assert np.all(q_dot * peak >= 0)
+        assert np.abs(q_dot).max() == pytest.approx(abs(peak), rel=0.04)
+        np.testing.assert_allclose(np.diff(q) * 20, q_dot[1:], atol=1e-9)
+    times = {n: preliminary.response_time(*of) for n, of in tests.past_movement.items()}
     assert times["idle"] == pytest.approx(0.40, abs=0.01)
     assert times["moving"] == pytest.approx(0.105, abs=0.01)
-    alone, together = (q_dot[:40] for _, q_dot in of_plant.coupling.values())
+    alone, together = (q_dot[:40] for _, q_dot in tests.coupling.values())
     np.testing.assert_allclose(together, alone, atol=0.002)  # "marginal and neglectable"
 
 
 @pytest.mark.parametrize("machine", [COARSE, replace(COARSE, q_start=())])
 def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     """Nets that stand still: the gap is what the machine moved, from its own start pose."""
-
-    class Watched(TwoSpeeds):
-        def step(self, machine, state, u):
-            self.commands[-1].append(u)
-            return PLANT.step(machine, state, u)
-
-        def reset(self, machine, q):
-            super().reset(machine, q)
-            return PLANT.reset(machine, q)
-
-    plant = Watched(0, 0)
+    plant = Recorder()
     gap = preliminary.sim_to_real(machine, {"machine": plant, "nets": TwoSpeeds(0.0, 0.0)}, 7)
-    u = np.array(plant.commands[0])
-    q = preliminary.simulate(machine, PLANT, plant.starts[0], u)
+    u = np.array(plant.u)
     assert u.shape == (600, 20, 5) and not u[..., 1].any()
     assert np.all((np.abs(u) > 0.07).sum(axis=-1).max(axis=0) > 1)  # several joints at once
-    start = machine.q_start or (LOW + HIGH) / 2
-    np.testing.assert_allclose(q[0], np.tile(start, (20, 1)))
+    start = np.tile(machine.q_start or (LOW + HIGH) / 2, (20, 1))
+    q = np.array([start, *plant.q])
     p = tool_position(forward_kinematics(BROKK_170, q))
     np.testing.assert_allclose(gap.q, q[0] - q[1:], atol=1e-12)
     np.testing.assert_allclose(gap.q_dot, -20 * np.diff(q, axis=0), atol=1e-12)

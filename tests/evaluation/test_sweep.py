@@ -31,21 +31,10 @@ def short(monkeypatch):
     monkeypatch.setattr(sweep, "task_sequences", lambda machine: SEQUENCES)
 
 
-def test_run_seed__refuses_policies_of_another_training(tmp_path):
-    sweep.run_seed(BROKK_170, NET, RECIPE, tmp_path, 2, 4)
-    other = replace(RECIPE, task=TaskConfig(episode_s=0.8))
-    with pytest.raises(ValueError, match=r"seed_4\.npz: recipe: expected .*0\.8.*, got .*0\.6"):
-        sweep.run_seed(BROKK_170, NET, other, tmp_path, 2, 4)
-
-
 def rows(error):
     """Two sequences from two starts."""
-    return [
-        {"controller": "rl", "sequence": s, "start": i, "kind": "workspace"}
-        | dict.fromkeys(metrics.COLUMNS, error + i)
-        for s in "xy"
-        for i in (0, 1)
-    ]
+    of = [{"start": i} | dict.fromkeys(metrics.COLUMNS, error + i) for i in (0, 1)]
+    return [{"controller": "rl", "sequence": s} | row for s in "xy" for row in of]
 
 
 def test_sweep__counts_a_seed_once(tmp_path, monkeypatch, capsys):
@@ -63,6 +52,7 @@ def test_sweep__counts_a_seed_once(tmp_path, monkeypatch, capsys):
 
 
 def test_sweep__trains_and_scores_each_seed_once(tmp_path):
+    """And refuses to go on from policies of another training."""
     arguments = (BROKK_170, NET, RECIPE, [3, 4], tmp_path / "new", 2)
     table = sweep.sweep(*arguments)
     names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("npz", "npz.csv")]
@@ -76,3 +66,6 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path):
     written = json.loads((tmp_path / "new" / "sweep.json").read_text())["runs"]
     assert [row["seed"] for row in written] == [3] * 6 + [4] * 6
     assert written[6:] == [{"seed": 4} | row for row in alone]
+    other = replace(RECIPE, task=TaskConfig(episode_s=0.8))
+    with pytest.raises(ValueError, match=r"seed_4\.npz: recipe: expected .*0\.8.*, got .*0\.6"):
+        sweep.run_seed(BROKK_170, NET, other, tmp_path / "new", 2, 4)

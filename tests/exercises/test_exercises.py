@@ -1,23 +1,19 @@
 """Each exercise passes with its solution, and says what is missing and why an answer is wrong."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-import exercises
 from brokk_min import actuator, env, jacobian, kinematics, machine
 from exercises.__main__ import FILES, main
 from exercises.hunt import bugs, judge
 from exercises.symptoms import SYMPTOMS, measure
 from exercises.verdict import judge as verdict
 
-ROOT = Path(exercises.__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 MODULES = {number: importlib.import_module(f"exercises.{FILES[number].stem}") for number in FILES}
 
 
@@ -54,8 +50,7 @@ def damped_velocities(J, v, w0, k):
 
 
 def lever_arm(a, b, gamma):
-    triangle = {"cylinder_base": a, "cylinder_rod": b, "cylinder_angle": 0.0}
-    return float(actuator.lever_arm(SimpleNamespace(column=triangle.__getitem__), gamma))
+    return a * b * np.sin(gamma) / np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(gamma))
 
 
 def shifted_jacobian(rows, q):

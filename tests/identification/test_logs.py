@@ -28,6 +28,10 @@ def write(path, columns):
     return path
 
 
+def read_columns(folder, columns, machine=BROKK_170):
+    return read_log(write(folder / "log.npz", columns), machine)
+
+
 def table(run, time, seed=0, joints=("a", "b")):
     rng = np.random.default_rng(seed)
     columns = {"run": np.array([run] * len(time)), "time": np.asarray(time, float)}
@@ -57,9 +61,7 @@ def test_write_log__reads_back(tmp_path, suffix):
     for got, written in zip(again.recordings, log.recordings, strict=True):
         np.testing.assert_allclose(got.u, written.u, atol=tolerance)
         np.testing.assert_allclose(got.q, written.q, atol=tolerance)
-        np.testing.assert_allclose(
-            got.q_dot, velocity_of(written.q, 4), atol=max(tolerance, 1e-12) * 30
-        )
+        np.testing.assert_allclose(got.q_dot, velocity_of(written.q, 4), atol=30 * tolerance)
 
 
 # --- resampling -----------------------------------------------------------------------------------
@@ -80,8 +82,7 @@ def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed, start
     time = np.where(np.abs(tenths - np.rint(tenths)) < 0.01, time + 1e-4, time)
     time[0] = start
     columns = table("x", time, seed, ("a",))
-    path = write(tmp_path_factory.getbasetemp() / "looped.npz", columns)
-    (recording,) = read_log(path, BROKK_170).recordings
+    (recording,) = read_columns(tmp_path_factory.getbasetemp(), columns).recordings
     grid = start + np.arange(int((time[-1] - start) * 20) + 1) / 20
     u, q = [], []
     for now in grid:
@@ -96,30 +97,19 @@ def test_read_log__resamples_as_a_loop_does(tmp_path_factory, steps, seed, start
     np.testing.assert_allclose(recording.q[:, 0], q, atol=tolerance)
 
 
-def test_read_log__takes_means_of_fast_commands_by_hand(tmp_path):
-    """100 Hz: a step of the command between two ticks keeps its moment."""
-    time = np.arange(41) / 100
-    columns = {"run": np.repeat("x", 41), "time": time, "u_a": (time > 0.175).astype(float)}
-    columns |= {"q_a": time}
-    (recording,) = read_log(write(tmp_path / "fast.npz", columns), BROKK_170).recordings
-    np.testing.assert_allclose(recording.u[:, 0], [0, 0, 0, 0.4, 1, 1, 1, 1, 1])
-    np.testing.assert_allclose(recording.q[:, 0], 0.05 * np.arange(9), atol=1e-9)
-
-
-@pytest.mark.parametrize("rate", [10.0, 25.0, 50.0])
-def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate):
+def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path):
     """A log at 100 Hz: 0.2 rad/s for 3 s, the command from 1 s on."""
     rows = [f"a,{i / 100},{float(i >= 100)},{0.2 * i / 100}" for i in range(301)]
     (tmp_path / "log.csv").write_text("\n".join(["run,time,u_a,q_a", *rows]) + "\n")
-    machine = replace(BROKK_170, rate=rate)
+    machine = replace(BROKK_170, rate=25.0)
     log = read_log(tmp_path / "log.csv", machine)
-    time = np.arange(round(3 * rate) + 1) / rate
+    time = np.arange(76) / 25
     np.testing.assert_allclose(log.recordings[0].q[:, 0], 0.2 * time, atol=1e-9)
     np.testing.assert_allclose(log.recordings[0].u[:, 0], time >= 1)
     np.testing.assert_allclose(log.recordings[0].q_dot[3:, 0], 0.2, atol=1e-9)
     write_log(tmp_path / "again.csv", log)
     again = read_log(tmp_path / "again.csv", machine)
-    assert again.rate == log.rate == rate
+    assert again.rate == log.rate == 25
     np.testing.assert_allclose(again.recordings[0].q, log.recordings[0].q, atol=1e-6)
     with pytest.raises(ValueError, match=r"expected s, at 200 Hz, .*or more, got 100 Hz"):
         read_log(tmp_path / "log.csv", replace(BROKK_170, rate=200.0))
@@ -128,30 +118,22 @@ def test_read_log__has_the_requested_rate_and_refuses_slower_logs(tmp_path, rate
 # --- which recordings, which joints ---------------------------------------------------------------
 
 
-def test_read_log__cuts_a_recording_at_gaps(tmp_path):
+def test_read_log__cuts_a_recording_at_gaps_and_assumes_no_rest_after_them(tmp_path):
     time = np.arange(90) / 20
     time[30:] += 0.15  # 0.2 s between samples: bridged
     time[60:] += 0.25  # 0.3 s: cut
-    time[88:] += 0.25  # too few samples follow
-    columns = table("x", time)
-    first, second = read_log(write(tmp_path / "log.npz", columns), BROKK_170).recordings
-    assert first.name == "x" and second.name == "x#2"
-    np.testing.assert_allclose(second.q[:, 0], columns["q_a"][63:88], atol=1e-9)
-    assert len(first.q) == len(first.q_dot) == 60 + 3
-    np.testing.assert_allclose(first.u[29:33, 0], columns["u_a"][29])  # held over the gap
-
-
-@pytest.mark.parametrize("samples", [2, 4, 7])
-def test_read_log__does_not_assume_rest_after_a_gap(tmp_path, samples):
-    time = np.arange(90) / 20
-    time[60:] += 1.0
+    time[86:] += 0.25  # too few samples follow
     columns = table("x", time, 0, ("a",)) | {"q_a": 0.3 * time, "u_a": np.arange(90) / 90}
     columns |= {"q_dot_a": np.full(90, 9.0)}  # nobody reads it
-    machine = replace(BROKK_170, velocity_samples=samples)
-    first, second = read_log(write(tmp_path / "log.npz", columns), machine).recordings
+    machine = replace(BROKK_170, velocity_samples=7)
+    first, second = read_columns(tmp_path, columns, machine).recordings
+    assert first.name == "x" and second.name == "x#2"
+    assert len(first.q) == len(first.q_dot) == 60 + 3
+    np.testing.assert_allclose(first.u[29:33, 0], 29 / 90)  # held over the gap
+    np.testing.assert_allclose(second.q[:, 0], 0.3 * time[66:86], atol=1e-9)
     np.testing.assert_allclose(second.q_dot, 0.3, atol=1e-9)
-    np.testing.assert_allclose(second.u[:, 0], columns["u_a"][59 + samples :])
-    assert first.q_dot[0, 0] == 0.0  # but before a recording
+    np.testing.assert_allclose(second.u[:, 0], columns["u_a"][66:86])
+    assert first.q_dot[0, 0] == 0.0  # at rest before a recording
 
 
 def test_join_logs__joins_files_of_the_same_joints_only(tmp_path):
@@ -182,18 +164,12 @@ def swinging(rate=20.0, seconds=20.0):
     return columns | {"u_b": 0 * time, "q_a": q[0], "q_b": q[1]}
 
 
-def of_speeds(*speeds):
+def of_speeds(a, b):
     """A machine with joints "a" and "b" of these nominal speeds [rad/s]."""
-    known = dict(zip(("a", "b"), speeds, strict=True))
-    renamed = [
-        replace(joint, name=name, q_dot_up=known[name], q_dot_down=known[name])
-        for joint, name in zip(BROKK_170.joints, known, strict=False)
-    ]
-    return replace(BROKK_170, joints=(*renamed, *BROKK_170.joints[2:]))
-
-
-def read_columns(tmp_path, columns, machine=BROKK_170):
-    return read_log(write(tmp_path / "log.npz", columns), machine)
+    one, two, *others = BROKK_170.joints
+    one = replace(one, name="a", q_dot_up=a, q_dot_down=a)
+    two = replace(two, name="b", q_dot_up=b, q_dot_down=b)
+    return replace(BROKK_170, joints=(one, two, *others))
 
 
 def speed_of(log):
@@ -210,33 +186,22 @@ def test_read_log__leaves_out_readings_that_no_motion_explains(tmp_path, wrong, 
     columns = swinging()
     sound = read_columns(tmp_path, columns, machine)
     assert sound.warnings == () and len(sound.recordings) == 1
-    rows = {"q_a": [0, 40, 150, 151], "q_b": [60, 399]}
-    broken = columns | {name: columns[name].copy() for name in rows}
-    for name, where in rows.items():
-        broken[name][where] = wrong
-    log = read_columns(tmp_path, broken, machine)
+    columns["q_a"][[0, 40, 150, 151]] = columns["q_b"][[60, 399]] = wrong
+    log = read_columns(tmp_path, columns, machine)
     assert len(log.recordings) == 1  # the gaps are short
     np.testing.assert_allclose(log.recordings[0].q, sound.recordings[0].q[1:-1], atol=5e-3)
+    np.testing.assert_allclose(log.recordings[0].u, sound.recordings[0].u[1:-1], atol=1e-12)
     assert (speed_of(log) < speed_of(sound) + 0.05).all()
     assert len(log.warnings) == 2
     assert "log.npz: row 2: expected q_a at 0.5" in log.warnings[0]
-    assert log.warnings[0].endswith(
-        "not read in 4 of the rows, which are left out or begin a new recording"
-    )
+    end = "not read in 4 of the rows, which are left out or begin a new recording"
+    assert log.warnings[0].endswith(end)
     assert "log.npz: row 62: expected q_b at 0.0" in log.warnings[1]
 
 
-def test_read_log__keeps_the_commands_of_rows_that_were_not_read(tmp_path):
-    columns = swinging()
-    columns["q_a"][100] = 0.0
-    (one,) = read_columns(tmp_path, columns).recordings
-    np.testing.assert_allclose(one.u[:, 0], columns["u_a"], atol=1e-12)
-
-
-@pytest.mark.parametrize("rate", [20.0, 100.0])
-def test_read_log__keeps_the_readings_of_a_noisy_sensor(tmp_path, rate):
+def test_read_log__keeps_the_readings_of_a_noisy_sensor(tmp_path):
     """A potentiometer, whose noise of 0.01 rad is several rad/s from row to row at 100 Hz."""
-    columns = swinging(rate=rate, seconds=100.0)
+    columns = swinging(rate=100.0, seconds=100.0)
     noise = np.random.default_rng(1).normal(0, 0.01, (2, len(columns["time"])))
     columns |= {"q_a": columns["q_a"] + noise[0], "q_b": columns["q_b"] + noise[1]}
     assert read_columns(tmp_path, columns).warnings == ()
@@ -256,10 +221,8 @@ def test_read_log__refuses_a_sensor_that_is_slower_than_the_rows(tmp_path, every
     """Only the moving joint's values repeat; a parked joint repeats its value anyway."""
     columns = swinging()
     columns["q_a"] = columns["q_a"][np.arange(400) // every * every]
-    refusal = (
-        rf"run x, q of \['a'\]: expected new angles at 20 Hz .*, got a new one every {every} rows"
-    )
-    with pytest.raises(ValueError, match=refusal):
+    wanted, got = "expected new angles at 20 Hz .*", f"got a new one every {every} rows"
+    with pytest.raises(ValueError, match=rf"run x, q of \['a'\]: {wanted}, {got}"):
         read_columns(tmp_path, columns)
     fast = swinging(rate=20.0 * every)
     fast["q_a"] = fast["q_a"][np.arange(len(fast["time"])) // every * every]
@@ -277,8 +240,6 @@ def test_join_recordings__marks_recordings_in_which_a_joint_is_driven():
     samples = join_recordings(Log(("a", "b", "c"), recordings))
     assert samples.moves.tolist() == [[True, False, True]] * 6 + [[False, False, True]] * 6
     assert [w.tolist() for w in samples.windows(3, 2)] == [[2, 3], [], [2, 3, 8, 9]]
-    assert samples.starts(1, 2, 2).tolist() == [1, 3, 7, 9]
-    np.testing.assert_allclose(samples.target[:5, 0], 2.0)  # 0.1 rad in 0.05 s
 
 
 # --- bad logs -------------------------------------------------------------------------------------
@@ -325,12 +286,11 @@ def test_read_log__names_file_and_place_of_what_is_wrong(tmp_path, case):
 
 
 def test_read_log__accepts_numbers_as_names_spaces_and_a_byte_order_mark(tmp_path):
-    content = b"\xef\xbb\xbf" + GOOD.replace(",u_a,", ", u_a, ").replace("\n", "\r\n").encode()
-    for text, name in ((content, "x"), (GOOD.replace("x,", "7,").encode(), "7")):
-        (tmp_path / "good.csv").write_bytes(text)
-        (recording,) = read_log(tmp_path / "good.csv", BROKK_170).recordings
-        np.testing.assert_allclose(recording.u[:, 0], [0.1, 0.2, 0.3, 0.4])
-        assert recording.name == name
+    text = GOOD.replace(",u_a,", ", u_a, ").replace("x,", "7,").replace("\n", "\r\n")
+    (tmp_path / "good.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    (recording,) = read_log(tmp_path / "good.csv", BROKK_170).recordings
+    np.testing.assert_allclose(recording.u[:, 0], [0.1, 0.2, 0.3, 0.4])
+    assert recording.name == "7"
 
 
 def test_driven__is_no_joint_that_creeps_a_count_under_a_stick_at_rest():

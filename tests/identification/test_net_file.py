@@ -1,6 +1,6 @@
 """Files of nets: what is saved is loaded, and nothing else is."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,31 +19,19 @@ from brokk_min.identification.net_file import (
 )
 from brokk_min.machine import BROKK_170
 
-
-def valve_net():
-    zones = np.array([[0.1, 0.2], [0.0, 0.05], [0.07, 0.07]])
-    return ValveNet(**vars(random_net(rows=4)), dead_zones=zones)
-
-
-def ensemble():
-    net = valve_net()
-    weights = tuple(np.stack([w, 2 * w], axis=1) for w in net.weights)
-    return NetEnsemble(**(vars(net) | {"weights": weights}))
+ZONES = np.array([[0.1, 0.2], [0.0, 0.05], [0.07, 0.07]])
+VALVE = ValveNet(**vars(random_net(rows=4)), dead_zones=ZONES)
+PAIRS = tuple(np.stack([w, 2 * w], axis=1) for w in VALVE.weights)
+NETS = [random_net(), VALVE, NetEnsemble(**(vars(VALVE) | {"weights": PAIRS}))]
 
 
-@pytest.mark.parametrize("net", [random_net(), valve_net(), ensemble()])
+@pytest.mark.parametrize("net", NETS)
 def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
-    history = np.random.default_rng(2).uniform(-1, 1, (6, 3, 3, 13)).astype(np.float32)
     save_net(tmp_path / "net.npz", net)
     loaded = load_net(tmp_path / "net.npz")
     assert type(loaded) is type(net)
-    for field in fields(net):
-        one, two = getattr(net, field.name), getattr(loaded, field.name)
-        if field.name != "weights":
-            assert np.array_equal(one, two), field.name
-    for one, two in zip(net.weights, loaded.weights, strict=True):
-        assert np.array_equal(one, two) and one.dtype == two.dtype
-    np.testing.assert_array_equal(loaded.predict(history), net.predict(history))
+    np.testing.assert_equal(vars(loaded), vars(net))
+    assert fingerprint(loaded) == fingerprint(net)  # types of numbers, too
 
 
 @pytest.mark.parametrize(
@@ -62,17 +50,15 @@ def test_load_net__names_file_and_fault(tmp_path, change, message):
         load_net(path)
 
 
-def test_fingerprint__differs_between_nets_and_survives_a_file(tmp_path):
+def test_fingerprint__differs_between_nets():
     net = random_net()
-    save_net(tmp_path / "net.npz", net)
-    assert fingerprint(load_net(tmp_path / "net.npz")) == fingerprint(net)
     weights = (net.weights[0] + 1e-6, *net.weights[1:])
     others = [joint_nets(net, ["j1"]), replace(net, rate=25.0), replace(net, weights=weights)]
     assert len({fingerprint(other) for other in (net, *others)}) == 4
 
 
-@pytest.mark.parametrize("net", [random_net(), valve_net(), ensemble()])
-@pytest.mark.parametrize("joints", [["j2", "j0"], ["j1"], ["j0", "j1", "j2"]])
+@pytest.mark.parametrize("net", NETS)
+@pytest.mark.parametrize("joints", [["j2", "j0"], ["j1"]])
 def test_joint_nets__predict_as_they_do_among_others(net, joints):
     index = [net.joints.index(name) for name in joints]
     history = np.random.default_rng(4).uniform(-1, 1, (20, 3, 3, 13)).astype(np.float32)
