@@ -12,9 +12,9 @@ from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.jacobian import Gains
 from brokk_min.machine import BROKK_170, Machine
 
-GAIN = 3.0  # of `obedient_net`
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 DRIVEN = [0, 2, 3, 4]  # joints of the Brokk
+LOW = replace(BROKK_170, name="low", ground=-100.0)  # no pose is in the ground
 
 
 class Idle:
@@ -86,7 +86,7 @@ def obedient_net(machine):
     weights = [np.zeros_like(weight) for weight in net.weights]
     weights[0][:, -1, 0], weights[1][:, 0] = 1.0, 2.0  # u + 2, never cut by the ReLU
     weights[2][:, 0, 0] = 1.0
-    weights[4][:, 0, 0], weights[5][:, 0] = GAIN, -2.0 * GAIN
+    weights[4][:, 0, 0], weights[5][:, 0] = 3.0, -6.0  # 3 u
     scale, mean = np.ones_like(net.input_scale), np.zeros_like(net.input_mean)
     return replace(
         net, weights=tuple(weights), input_mean=mean, input_scale=scale, output_low=-net.output_high

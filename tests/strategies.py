@@ -1,7 +1,5 @@
 """Hypothesis strategies: machines that are no Brokk, and their poses."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 tests/properties/test_reward.py has its memory and its costs.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from itertools import pairwise
@@ -18,16 +16,7 @@ from strategies import machines, posed
 
 from brokk_min import env
 from brokk_min.beyond import interface
-from brokk_min.beyond.interface import (
-    Memory,
-    accumulate,
-    command,
-    observation_scale,
-    observe,
-    remember,
-    smooth_angles,
-)
-from brokk_min.env import measure
+from brokk_min.beyond.interface import Memory, command, observation_scale, smooth_angles
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170
 
@@ -63,12 +52,12 @@ def test_remember__has_the_velocity_that_the_tool_had_when_the_joints_had_theirs
     past = now.q - machine.dt * (machine.velocity_samples - 1) / 2 * q_dot
     tools = [forward_kinematics(machine, past + s * 1e-6 * q_dot).p[:, -1] for s in (1, -1)]
     expected = (tools[0] - tools[1]) / 2e-6 + noise[:3]
-    first = remember(machine, None, now)
+    first = interface.remember(machine, None, now)
     np.testing.assert_allclose(first.v_tool, expected, atol=1e-6)
     first = first._replace(v_goal=expected + 1e-3)  # a small error, which no cut hides
-    found, same = remember(machine, first, now), now._replace(v_tool=expected)
+    found, same = interface.remember(machine, first, now), now._replace(v_tool=expected)
     np.testing.assert_allclose(found.v_tool, expected, atol=1e-6)
-    integral = accumulate(machine, first, same).error_integral
+    integral = interface.accumulate(machine, first, same).error_integral
     np.testing.assert_allclose(found.error_integral, integral, atol=1e-6 / machine.rate)
 
 
@@ -76,17 +65,16 @@ def test_observe__by_hand():
     """Smoothed angles, the newer half of the paper's samples by their weights, our own blocks."""
     integral = (0.02, -0.01, 0.03)
     v_goal = np.array([0.3, -0.1, -0.15], np.float32)
-    measured = measure(BROKK_170, numbered_history(), v_goal)
-    obs = observe(BROKK_170, measured, memory(0, integral))
+    measured = env.measure(BROKK_170, numbered_history(), v_goal)
+    obs = interface.observe(BROKK_170, measured, memory(0, integral))
     assert obs.shape == (91,) and obs.dtype == np.float32
+    mean, std, _ = env.observation_table(BROKK_170)
     paper = env.features(BROKK_170, measured)
-    paper[3:6] = np.array(V_TOOL) / env.observation_table(BROKK_170)[1][3:6]
+    paper[3:6] = V_TOOL / std[3:6]
     np.testing.assert_allclose(obs[:7], 0.75 * paper[:7], rtol=1e-5)
     q = measured.q.astype(float)
     q[DRIVEN] = smooth_angles(BROKK_170, measured.history)
-    low, high = (BROKK_170.column(end)[DRIVEN] for end in ("q_min", "q_max"))
-    middle, deviation = (low + high) / 2, (high - low) / 12**0.5
-    np.testing.assert_allclose(obs[7:11], (q[DRIVEN] - middle) / deviation, rtol=1e-4)
+    np.testing.assert_allclose(obs[7:11], (q[DRIVEN] - mean[7:111:26]) / std[7:111:26], rtol=1e-4)
     fading = np.exp(-np.arange(5, -1, -1) / 2)  # of the 6 newest samples, newest last
     fading /= np.sum(fading**2) ** 0.5
     q_dot, u = paper[7:111].reshape(4, 2, 13)[:, 1, 7:], paper[111:].reshape(4, 13)[:, 7:]

@@ -1,7 +1,5 @@
 """Nets that read what commands open, joints that are held, and means of several nets."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,23 +1,19 @@
-"""Episodes: distributions of poses and goals, goals that change, rows that are replaced."""
+"""Episodes: distributions of poses, goals and noise, rows that are replaced."""
 
 import numpy as np
 import pytest
 from helpers_machines import closed_form
+from numpy.random import default_rng
 from scipy import stats
 
-from brokk_min.actuator import PlantState
 from brokk_min.env import TaskConfig, observation_table
 from brokk_min.learning import episodes
 from brokk_min.machine import BROKK_170
 
 
-def generator(seed=0):
-    return np.random.default_rng(seed)
-
-
 def test_draw_pose__is_uniform_and_sometimes_in_the_ground():
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
-    poses = episodes.draw_pose(BROKK_170, generator(), 2000)
+    poses = episodes.draw_pose(BROKK_170, default_rng(0), 2000)
     for fraction in ((poses - low) / (high - low)).T:
         assert stats.kstest(fraction, "uniform").pvalue > 1e-3
     assert 0.02 < (closed_form(poses)[1] < 0).mean() < 0.98
@@ -25,7 +21,7 @@ def test_draw_pose__is_uniform_and_sometimes_in_the_ground():
 
 def test_draw_goal__has_the_configured_fractions_speeds_and_directions():
     config = TaskConfig(zero_goals=0.2, axis_goals=0.5)
-    goals = episodes.draw_goal(BROKK_170, config, generator(6), 20_000)
+    goals = episodes.draw_goal(BROKK_170, config, default_rng(6), 20_000)
     speed = np.linalg.norm(goals, axis=-1)
     components = np.count_nonzero(goals, axis=-1)
     for number, fraction in ((0, 0.2), (1, 0.5), (3, 0.3)):
@@ -36,9 +32,8 @@ def test_draw_goal__has_the_configured_fractions_speeds_and_directions():
     for axis in (*np.eye(3), *-np.eye(3)):
         assert np.mean((along == axis).all(-1)) == pytest.approx(1 / 6, abs=0.02)
     directions = goals[components == 3] / speed[components == 3, None]
-    np.testing.assert_allclose(
-        directions.T @ directions / len(directions), np.eye(3) / 3, atol=0.03
-    )
+    moments = directions.T @ directions / len(directions)
+    np.testing.assert_allclose(moments, np.eye(3) / 3, atol=0.03)
 
 
 @pytest.mark.parametrize(
@@ -46,33 +41,23 @@ def test_draw_goal__has_the_configured_fractions_speeds_and_directions():
 )
 def test_draw_hold__is_whole_ticks_and_at_least_one(seconds, ticks):
     config = TaskConfig(hold_min_s=seconds, hold_max_s=seconds)
-    assert episodes.draw_hold(BROKK_170, config, generator(), 3).tolist() == [ticks] * 3
-
-
-def test_new_goals__change_where_their_time_is_over():
-    state = episodes.reset(BROKK_170, TaskConfig(), generator(), 3)
-    state = state._replace(v_goal=np.abs(state.v_goal) + 0.01, goal_ticks=np.array([1, 0, 2]))
-    after = episodes.new_goals(BROKK_170, TaskConfig(), state, generator())
-    assert (after.v_goal != state.v_goal).any(axis=1).tolist() == [False, True, False]
-    assert after.goal_ticks[[0, 2]].tolist() == [1, 2]
-    assert 40 <= after.goal_ticks[1] <= 120  # 2 to 6 s
+    assert episodes.draw_hold(BROKK_170, config, default_rng(0), 3).tolist() == [ticks] * 3
 
 
 def test_replace_rows__replaces_whole_rows_and_nothing_else():
-    old = episodes.reset(BROKK_170, TaskConfig(), generator(1), 5)
-    new = episodes.reset(BROKK_170, TaskConfig(), generator(2), 2)
+    old = episodes.reset(BROKK_170, TaskConfig(), default_rng(1), 5)
+    new = episodes.reset(BROKK_170, TaskConfig(), default_rng(2), 2)
     state = episodes.replace_rows(old, np.array([4, 1]), new)
-    for values in zip(old, new, state, strict=True):
-        pairs = zip(*values) if isinstance(values[0], PlantState) else [values]
-        for before, fresh, after in pairs:
-            assert np.array_equal(after[[0, 2, 3]], before[[0, 2, 3]])
-            assert np.array_equal(after[[4, 1]], fresh)
+    arrays = ((*one.plant, *one[1:]) for one in (old, new, state))  # the plant's stand first
+    for before, fresh, after in zip(*arrays, strict=True):
+        assert np.array_equal(after[[0, 2, 3]], before[[0, 2, 3]])
+        assert np.array_equal(after[[4, 1]], fresh)
     assert not np.array_equal(old.q, state.q)
     assert episodes.replace_rows(None, np.array([1]), None) is None
 
 
 def test_draw_noise__is_uniform_up_to_the_largest():
-    noise = episodes.draw_noise(BROKK_170, 0.05, 400, generator())
+    noise = episodes.draw_noise(BROKK_170, 0.05, 400, default_rng(0))
     assert noise.dtype == np.float32 and noise.shape == (400, observation_table(BROKK_170)[2].sum())
     assert np.abs(noise).max() <= 0.05
     assert stats.kstest(noise[:, 7] / 0.1 + 0.5, "uniform").pvalue > 1e-3

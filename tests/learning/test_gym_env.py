@@ -1,22 +1,19 @@
 """The Gymnasium environments: resets in the same step, final observations, registration."""
 
 import warnings
-from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers_machines import obedient_net, small_net
+from helpers_machines import LOW, obedient_net, small_net
 
 from brokk_min.actuator import PLANT
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.env import PAPER, TaskConfig
 from brokk_min.learning.gym_env import TaskEnv, TaskVectorEnv
-from brokk_min.machine import BROKK_170
 
-LOW = replace(BROKK_170, name="low", ground=-100.0)  # no pose is in the ground
 SHORT = TaskConfig(episode_s=1.0, noise=0.0)
 NET = small_net(LOW, np.random.default_rng(0))
 ID = "brokk_min.learning.gym_env:brokk_min/Brokk170-v0"

@@ -5,53 +5,42 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers_machines import POSE, small_net
+from helpers_bus import random_policy
+from helpers_machines import POSE
 
 from brokk_min import env
 from brokk_min._files import SHIPPED
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import actor_weights
-from brokk_min.learning.policy import POLICIES, Policy, load_policy, save_policy
+from brokk_min.learning.policy import POLICIES, load_policy, save_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.ppo import Agent
 
-NET = small_net(BROKK_170, np.random.default_rng(0))
-SIZES = {"paper": 163, "beyond": 91}
-
-
-def agent(size):
-    """An actor whose weights, biases included, are far from their start."""
-    generator = torch.Generator().manual_seed(0)
-    agent = Agent(size, 4, -1.0)
-    with torch.no_grad():
-        for parameter in agent.parameters():
-            parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
-    return agent
-
-
-def policy(kind):
-    return Policy(BROKK_170, {"seed": 0}, actor_weights(agent(SIZES[kind])), NET, kind)
-
 
 def test_act__equals_the_actor_of_torch():
+    """Its weights, biases included, are far from their start."""
+    torch.manual_seed(0)
+    agent = Agent(91, 4, -1.0)
+    with torch.no_grad():
+        for parameter in agent.parameters():
+            parameter += 0.1 * torch.randn(parameter.shape)
     obs = np.random.default_rng(0).normal(0, 2, (3, 7, 91)).astype(np.float32)
-    actor = agent(91)
-    expected = actor.actor(torch.from_numpy(obs)).detach().numpy()
+    expected = agent.actor(torch.from_numpy(obs)).detach().numpy()
     assert expected.std() > 0.05
-    found = Policy(BROKK_170, {}, actor_weights(actor), NET, "beyond").act(obs)
+    found = replace(random_policy("beyond"), weights=actor_weights(agent)).act(obs)
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_act__refuses_wrong_shapes_and_what_is_not_finite():
     for bad in (np.zeros(90), np.append(np.zeros(90), np.nan)):
         with pytest.raises(ValueError, match=r"observation: expected finite \(\.\.\., 91\), got"):
-            policy("beyond").act(bad)
+            random_policy("beyond").act(bad)
 
 
 @pytest.mark.parametrize("kind", ["paper", "beyond"])
 def test_controller__remembers_how_long_its_goal_is_zero(kind):
     """Valves of our agent close after 0.1 s of a zero goal; the paper's go on."""
-    controller = policy(kind)
+    controller = random_policy(kind)
     memory = controller.start(2)
     goals = np.array([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0]])
     state = env.initial_state(BROKK_170, np.tile(POSE, (2, 1)), goals)
@@ -72,13 +61,9 @@ def test_controller__remembers_how_long_its_goal_is_zero(kind):
     ],
 )
 def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message):
-    save_policy(tmp_path / "p.npz", policy("paper"))
-    name = {"name": f"m {change}"} if "tool_speed" in change else {}  # caches go by the name
-    machine = replace(BROKK_170, q_start=(), **change, **dict.fromkeys(name, "brokk170"))
-    env.observation_table.cache_clear()
+    save_policy(tmp_path / "p.npz", random_policy("paper"))
     with pytest.raises(ValueError, match=message):
-        load_policy(tmp_path / "p.npz", machine)
-    env.observation_table.cache_clear()
+        load_policy(tmp_path / "p.npz", replace(BROKK_170, q_start=(), **change))
 
 
 @pytest.mark.parametrize("file", POLICIES.values())

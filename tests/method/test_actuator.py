@@ -1,7 +1,5 @@
 """The plant: its calibration and its equations. The history. The nets against a plain loop."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -30,26 +28,16 @@ FAST = replace(BROKK_170, rate=200.0)  # a tick is one step of 5 ms
 LIMIT = 80 / 127
 MIDDLE = np.array([0.0, 0.5, 0.5, 1.7, 1.0])
 Q5 = 4
+ALONE = np.eye(5)[Q5]  # the command of q5
 
 
-def record(
-    machine: Machine, q: np.ndarray, u: np.ndarray
-) -> tuple[PlantState, np.ndarray, np.ndarray]:
-    """Last state, joint velocities and cylinder speeds (ticks, ..., n) under commands `u`."""
-    state = PLANT.reset(machine, q)
-    velocities, speeds = [], []
+def record(machine: Machine, q: np.ndarray, u: np.ndarray) -> tuple[PlantState, np.ndarray]:
+    """States and joint velocities, arrays (ticks, ..., n), under commands `u`."""
+    states = [PLANT.reset(machine, q)]
     for command in u:
-        state = PLANT.step(machine, state, command)
-        velocities.append(state.v / lever_arm(machine, state.q))
-        speeds.append(state.v)
-    return state, np.array(velocities), np.array(speeds)
-
-
-def only(joint: int, u: np.ndarray | list[float]) -> np.ndarray:
-    """Commands (ticks, 5) for one joint."""
-    commands = np.zeros((len(u), 5))
-    commands[:, joint] = u
-    return commands
+        states.append(PLANT.step(machine, states[-1], command))
+    found = PlantState(*map(np.array, zip(*states[1:], strict=True)))
+    return found, found.v / lever_arm(machine, found.q)
 
 
 # --- the plant's calibration, measured as on a machine --------------------------------------------
@@ -57,9 +45,9 @@ def only(joint: int, u: np.ndarray | list[float]) -> np.ndarray:
 
 def rise_time(before: float, ticks_before: int) -> float:
     """Time from the step to 80 counts until 63 % of the change in cylinder speed of q5 is done."""
-    u = only(Q5, [before] * ticks_before + [LIMIT] * 250)
-    _, _, speeds = record(FAST, np.array([0, 0.5, 0.5, 1.7, 0.0]), u)
-    speed = np.concatenate([[0.0], speeds[:, Q5]])[ticks_before:]
+    u = np.outer([before] * ticks_before + [LIMIT] * 250, ALONE)
+    states, _ = record(FAST, np.array([0, 0.5, 0.5, 1.7, 0.0]), u)
+    speed = states.v[ticks_before - 1 :, Q5]
     done = (speed - speed[0]) / (speed[-1] - speed[0])
     return int(np.argmax(done >= 0.63)) * FAST.dt
 
@@ -77,9 +65,9 @@ def test_plant_step__has_the_peak_speeds_of_the_machine():
     own = np.eye(5, dtype=bool)
     start = np.stack([np.where(own, q_min, MIDDLE), np.where(own, q_max, MIDDLE)])
     u = LIMIT * np.stack([np.eye(5), -np.eye(5)])
-    state, velocities, _ = record(FAST, start, np.broadcast_to(u, (4600, 2, 5, 5)))
+    states, velocities = record(FAST, start, np.broadcast_to(u, (4600, 2, 5, 5)))
     speeds = velocities[..., own] * np.array([[1], [-1]])  # (steps, 2, 5): of the swept joint
-    np.testing.assert_array_equal(state.q[:, own], [q_max, q_min])  # all got through
+    np.testing.assert_array_equal(states.q[-1][:, own], [q_max, q_min])  # all got through
     assert np.all(speeds >= 0)
     assert np.all(np.abs(speeds.max(axis=0) - goal) < tolerance), speeds.max(axis=0)
 
@@ -89,8 +77,8 @@ def test_plant_step__has_pump_enough_at_the_limit_and_too_little_at_full_command
     falling = -(np.arange(5) != 1).astype(float)  # the driven joints where they need most oil
 
     def loss(level: float) -> float:
-        _, _, alone = record(BROKK_170, q, only(Q5, np.full(25, -level)))
-        _, _, together = record(BROKK_170, q, np.tile(level * falling, (25, 1)))
+        _, alone = record(BROKK_170, q, np.tile(-level * ALONE, (25, 1)))
+        _, together = record(BROKK_170, q, np.tile(level * falling, (25, 1)))
         return 1 - together[-1, Q5] / alone[-1, Q5]
 
     assert abs(loss(LIMIT)) < 0.02
@@ -100,9 +88,9 @@ def test_plant_step__has_pump_enough_at_the_limit_and_too_little_at_full_command
 def test_plant_step__first_moves_at_eleven_counts():
     """8.9 counts of dead zone; the next 1.2 open the spool by less than 1 %."""
     for sign in (1, -1):
-        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 10 / 127))
+        _, velocities = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 10 / 127))
         assert not velocities.any()
-        _, velocities, _ = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 11 / 127))
+        _, velocities = record(BROKK_170, MIDDLE, np.full((100, 5), sign * 11 / 127))
         assert np.all(sign * velocities[-1] > 1e-4)
 
 
@@ -119,12 +107,9 @@ def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[d
         a = [0.0] * m.n if at < 0 else commands[at // per_tick].tolist()
         goal = []
         for joint, x in zip(m.joints, joints, strict=True):
-            g = 0.0
-            if x["z"] > m.valve_threshold:
-                part = min(1.0, (x["z"] - m.valve_threshold) / (1 - m.valve_threshold))
-                g = math.sqrt(3 * part**2 - 2 * part**3)
+            part = min(max(0.0, (x["z"] - m.valve_threshold) / (1 - m.valve_threshold)), 1.0)
             K = joint.cylinder_speed[0 if x["s"] > 0 else 1]
-            goal.append(K * x["s"] * g)
+            goal.append(K * x["s"] * math.sqrt(3 * part**2 - 2 * part**3))
         flow = sum(abs(j.cylinder_area * v) for j, v in zip(m.joints, goal, strict=True))
         pump = 1.0 if flow == 0 else min(1.0, m.pump_flow / flow)
         for i, (joint, x) in enumerate(zip(m.joints, joints, strict=True)):
@@ -132,11 +117,9 @@ def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[d
             us = math.copysign(max(0.0, (abs(a[i]) - zone) / (1 - zone)), a[i])
             zt = 1.0 if abs(x["s"]) > m.spool_threshold else 0.0
             tau = m.tau_valve_up if zt > x["z"] else m.tau_valve_down
-            if joint.cylinder_base:
-                b, c, gamma = joint.cylinder_base, joint.cylinder_rod, joint.cylinder_angle + x["q"]
-                r = b * c * math.sin(gamma) / math.sqrt(b * b + c * c - 2 * b * c * math.cos(gamma))
-            else:
-                r = joint.cylinder_rod
+            b, r, gamma = joint.cylinder_base, joint.cylinder_rod, joint.cylinder_angle + x["q"]
+            if b:
+                r *= b * math.sin(gamma) / math.sqrt(b * b + r * r - 2 * b * r * math.cos(gamma))
             new = {
                 "q": x["q"] + dt * x["v"] / r,
                 "v": x["v"] + dt * (goal[i] * pump - x["v"]) / m.tau_cylinder,
@@ -167,24 +150,20 @@ TO_THE_STOPS = np.full((30, 5), 0.6)  # commands; from 0.02 rad before the stops
 @example((BROKK_170, BROKK_170.column("q_min") + 0.02, -TO_THE_STOPS))
 def test_plant_step__is_its_equations(case):
     machine, q, u = case
-    state, velocities, _ = record(machine, q, u)
+    states, _ = record(machine, q, u)
     goal = slow_plant(machine, q, u)
-    for name, values in (("q", state.q), ("v", state.v), ("s", state.s), ("z", state.z)):
-        np.testing.assert_allclose(values, [x[name] for x in goal], atol=1e-12, err_msg=name)
-    arms = lever_arm(machine, state.q)
-    np.testing.assert_allclose(velocities[-1], [x["v"] for x in goal] / arms, atol=1e-12)
-    assert np.all(state.q >= machine.column("q_min")) and np.all(state.q <= machine.column("q_max"))
+    for name in "qvsz":
+        found = getattr(states, name)[-1]
+        np.testing.assert_allclose(found, [x[name] for x in goal], atol=1e-12, err_msg=name)
 
 
 @given(driven_machines())
 def test_lever_arm__is_the_derivative_of_the_cylinder_length(case):
     machine, q, _ = case
     base, rod, angle = (machine.column(f"cylinder_{name}") for name in ("base", "rod", "angle"))
-    arm = lever_arm(machine, q)
     length = lambda x: np.sqrt((base - rod * np.cos(x)) ** 2 + (rod * np.sin(x)) ** 2)  # noqa: E731
     slope = (length(angle + q + 1e-6) - length(angle + q - 1e-6)) / 2e-6
-    np.testing.assert_allclose(arm, np.where(base > 0, slope, rod), atol=1e-8)
-    assert np.all(arm > 0)
+    np.testing.assert_allclose(lever_arm(machine, q), np.where(base > 0, slope, rod), atol=1e-8)
 
 
 # --- histories ------------------------------------------------------------------------------------
@@ -211,9 +190,6 @@ def test_estimate_velocity__is_the_least_squares_slope_and_forgets_what_is_older
     time = 0.05 * np.arange(samples)
     fitted = [np.polyfit(time, row[-samples:], 1)[0] for row in q]
     np.testing.assert_allclose(velocity, fitted, atol=1e-8)
-    other = q.copy()
-    other[:, :4] = 1e6
-    np.testing.assert_array_equal(estimate_velocity(other, samples, 0.05), velocity)
     assert estimate_velocity(q.astype(np.float32), samples, 0.05).dtype == np.float32
     assert estimate_velocity([0, 3, 6, 9], 4, 0.07) == pytest.approx(3 / 0.07)  # whole numbers
 
@@ -250,9 +226,7 @@ def test_predict__is_a_loop_in_double_precision(leading):
 def test_nets_as_a_plant__move_driven_joints_by_velocity_times_dt():
     """A loop over joints and ticks: q + dt net(history with the command), then the new sample."""
     net = random_net(3, n=4, history=5)
-    start = np.array([0.0, 0.5, 0.5, 1.7, 1.0])
-    start.setflags(write=False)
-    state, angles, commands = net.reset(BROKK_170, start), [start] * 5, [np.zeros(5)] * 5
+    state, angles, commands = net.reset(BROKK_170, MIDDLE), [MIDDLE] * 5, [np.zeros(5)] * 5
     rng = np.random.default_rng(4)
     velocities = [np.zeros(5)] * 5
     for _ in range(8):
@@ -267,7 +241,7 @@ def test_nets_as_a_plant__move_driven_joints_by_velocity_times_dt():
             array.setflags(write=False)
         state = net.step(BROKK_170, state, u)
         np.testing.assert_allclose(state.q, q, atol=1e-5)
-    assert state.q[1] == 0.5 and np.abs(state.q - start)[DRIVEN].max() > 0.01
+    assert state.q[1] == 0.5 and np.abs(state.q - MIDDLE)[DRIVEN].max() > 0.01
     assert state.q.dtype == np.float64 and state.history.dtype == np.float32
 
 

@@ -10,17 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import machines
 
-from brokk_min import env as task
+from brokk_min import env
 from brokk_min.actuator import PLANT
-from brokk_min.env import (
-    action_to_pwm,
-    features,
-    initial_state,
-    measure,
-    observation_table,
-    transition,
-    velocity_deviations,
-)
 from brokk_min.kinematics import forward_kinematics, lowest_point, tool_position, tool_velocity
 from brokk_min.learning.episodes import new_goals, reset
 from brokk_min.machine import BROKK_170
@@ -44,27 +35,27 @@ class Obedient:
 
 def test_action_to_pwm__by_hand():
     """80 a in whole counts of the driven joints; clipped to -80."""
-    u = action_to_pwm(BROKK_170, [[0.5, -3.0, -0.01, 0.02], [1, 0, -1, 0]])
+    u = env.action_to_pwm(BROKK_170, [[0.5, -3.0, -0.01, 0.02], [1, 0, -1, 0]])
     np.testing.assert_allclose(u * 127, [[40, 0, -80, -1, 2], [80, 0, 0, -80, 0]], atol=1e-9)
-    np.testing.assert_array_equal(action_to_pwm(BROKK_170, [1, 0, -1, 0]), u[1])
+    np.testing.assert_array_equal(env.action_to_pwm(BROKK_170, [1, 0, -1, 0]), u[1])
 
 
 @pytest.mark.parametrize("action", [0.0, np.zeros(3), np.zeros((4, 1)), [0, np.nan, 0, np.inf]])
 def test_action_to_pwm__refuses_wrong_shapes_and_what_is_not_finite(action):
     with pytest.raises(ValueError, match=re.escape("action: expected finite (..., 4), got ")):
-        action_to_pwm(BROKK_170, action)
+        env.action_to_pwm(BROKK_170, action)
 
 
-# --- observation ----------------------------------------------------------------------------------
+# --- observation, one tick ------------------------------------------------------------------------
 
 
 def test_features__by_hand():
     """Each block of the table: (x - mean) / deviation, in its place."""
     v_goal = np.array([0.3, -0.1, -0.15], np.float32)
-    measured = measure(BROKK_170, numbered_history(), v_goal)
-    obs = features(BROKK_170, measured)
+    measured = env.measure(BROKK_170, numbered_history(), v_goal)
+    obs = env.features(BROKK_170, measured)
     assert obs.shape == (163,) and obs.dtype == np.float32
-    v_std, q_dot_std = velocity_deviations(BROKK_170)
+    v_std, q_dot_std = env.velocity_deviations(BROKK_170)
     np.testing.assert_allclose(obs[:3], v_goal / v_std, rtol=1e-5)
     np.testing.assert_allclose(obs[3:6], measured.v_tool / v_std, rtol=1e-5)
     assert obs[6] == pytest.approx((0.5 - 0.7) * 12**0.5 / 1.4, rel=1e-6)  # q2: 0 .. 1.4
@@ -88,7 +79,7 @@ def test_measure__is_in_physical_units_of_the_base_frame(machine, seed):
     history = rng.normal(0, 0.2, (4, machine.n, 3, machine.history))
     history[..., 0, :] = rng.uniform(low, high, (4, machine.n, 1))
     v_goal = rng.normal(size=(4, 3))
-    measured = measure(machine, history, v_goal)
+    measured = env.measure(machine, history, v_goal)
     np.testing.assert_array_equal(measured.v_goal, v_goal)
     np.testing.assert_array_equal(measured.history, history[:, machine.driven])
     np.testing.assert_array_equal(measured.q_dot, history[:, machine.driven, 1, -1])
@@ -99,8 +90,8 @@ def test_measure__is_in_physical_units_of_the_base_frame(machine, seed):
     )
     np.testing.assert_allclose(measured.v_tool, (ahead - behind) / 2e-6, atol=1e-7)
     size = 6 + len(machine.locked) + 3 * machine.history * len(machine.driven)
-    assert features(machine, measured).shape == (4, size)
-    mean, std, noisy = observation_table(machine)
+    assert env.features(machine, measured).shape == (4, size)
+    mean, std, noisy = env.observation_table(machine)
     assert mean.shape == std.shape == noisy.shape == (size,) and (std > 0).all()
 
 
@@ -109,15 +100,15 @@ def test_velocity_deviations__are_those_of_the_task():
 
     Tool and joints as in training: driven by the paper's PID on the plant.
     """
-    v_std, q_dot_std = velocity_deviations(BROKK_170)
+    v_std, q_dot_std = env.velocity_deviations(BROKK_170)
     np.testing.assert_allclose(v_std, 0.3 * (0.85 / 9) ** 0.5, rtol=0.02)
     pid = pids(BROKK_170, small_net(BROKK_170, np.random.default_rng(0)))["jacobian_pid_k0.1"]
     rng, config = np.random.default_rng(0), TaskConfig()
     state, memory = reset(BROKK_170, config, rng, 64), pid.start(64)
     seen = []
     for _ in range(300):
-        u, memory = pid(measure(BROKK_170, state.history, state.v_goal), memory)
-        state = transition(BROKK_170, PLANT, state, u)
+        u, memory = pid(env.measure(BROKK_170, state.history, state.v_goal), memory)
+        state = env.transition(BROKK_170, PLANT, state, u)
         state = new_goals(BROKK_170, config, state, rng)
         seen.append(np.concatenate([state.v_tool, state.q_dot, u], axis=-1))
     found = np.std(seen, axis=(0, 1))
@@ -128,52 +119,45 @@ def test_velocity_deviations__are_those_of_the_task():
 
 def test_measure__adds_noise_to_what_sensors_measure_in_deviations():
     """Each number of each machine has its own; commands have none."""
-    history, size = np.stack([numbered_history()] * 2), observation_table(BROKK_170)[2].sum()
+    history, size = np.stack([numbered_history()] * 2), env.observation_table(BROKK_170)[2].sum()
     assert size == 3 + 1 + 4 * 2 * 13
     kept, goals = history.copy(), np.zeros((2, 3), np.float32)
     noise = np.random.default_rng(0).uniform(-0.1, 0.1, (2, size)).astype(np.float32)
-    clean, noisy = (measure(BROKK_170, history, goals, error) for error in (0.0, noise))
+    clean, noisy = (env.measure(BROKK_170, history, goals, error) for error in (0.0, noise))
     np.testing.assert_array_equal(history, kept)
-    change = features(BROKK_170, noisy) - features(BROKK_170, clean)
+    change = env.features(BROKK_170, noisy) - env.features(BROKK_170, clean)
     np.testing.assert_allclose(change[:, 6:111], noise[:, 3:], atol=1e-4)
     assert not change[:, :3].any() and not change[:, 111:].any()
     np.testing.assert_array_equal(noisy.q[:, BROKK_170.driven], noisy.history[..., 0, -1])
     exact = tool_velocity(forward_kinematics(BROKK_170, noisy.q), history[..., 1, -1])
-    v_error = noise[:, :3] * velocity_deviations(BROKK_170)[0]
+    v_error = noise[:, :3] * env.velocity_deviations(BROKK_170)[0]
     np.testing.assert_allclose(noisy.v_tool - exact, v_error, atol=1e-6)
 
 
 def test_the_table_of_the_docstring__is_true():
     """Numbers, deviations and noise of the table are those of `observation_table`."""
-    rows = re.findall(
-        r"^\| (\d+)(?:-(\d+))? +\| .+? +\| (.+?) +\| (\w+) +\|", task.__doc__ or "", re.M
-    )
+    row = r"^\| (\d+)(?:-(\d+))? +\| .+? +\| (.+?) +\| (\w+) +\|"
+    rows = re.findall(row, env.__doc__, re.M)
     assert len(rows) == 5
-    (_, std, noisy), place = observation_table(BROKK_170), 0
+    (_, std, noisy), place = env.observation_table(BROKK_170), 0
     for first, last, deviation, noise in rows:
         assert int(first) == place
         place = int(last or first) + 1
         assert set(noisy[int(first) : place]) == {noise == "yes"}
         number = re.match(r"0\.\d{3}", deviation)
         assert not number or std[int(first) : place] == pytest.approx(float(number[0]), abs=5e-4)
-    assert (
-        place == len(std) == 163 and "(163,)" in task.__doc__ and "Box(-1, 1, (4,))" in task.__doc__
-    )
-    assert TaskConfig().episode_s == 20 and "20 s" in task.__doc__
-
-
-# --- one tick -------------------------------------------------------------------------------------
+    assert place == len(std) == 163 and TaskConfig().episode_s == 20
+    assert all(text in env.__doc__ for text in ("(163,)", "Box(-1, 1, (4,))", "20 s"))
 
 
 def test_transition__on_a_plant_of_ones_own_by_hand():
     """A plant that obeys the command moves each joint by u x 50 ms; encoders count in steps."""
     u = np.float32([40, 0, -80, 13, 0]) / 127
-    state = initial_state(BROKK_170, POSE, ZERO, Obedient())
-    assert state.lowest == pytest.approx(
-        lowest_point(forward_kinematics(BROKK_170, POSE)), abs=1e-5
-    )
-    assert initial_state(BROKK_170, [1] * 5, ZERO).q.dtype == float and state.goal_ticks > 1e9
-    after = transition(BROKK_170, Obedient(), state, u)
+    state = env.initial_state(BROKK_170, POSE, ZERO, Obedient())
+    lowest = lowest_point(forward_kinematics(BROKK_170, POSE))
+    assert state.lowest == pytest.approx(lowest, abs=1e-5)
+    assert env.initial_state(BROKK_170, [1] * 5, ZERO).q.dtype == float and state.goal_ticks > 1e9
+    after = env.transition(BROKK_170, Obedient(), state, u)
     np.testing.assert_allclose(after.q, POSE + 0.05 * u, atol=1e-12)
     np.testing.assert_allclose(after.q_dot, u, atol=1e-12)
     np.testing.assert_array_equal(after.history[:, 2, -1], u)
@@ -183,12 +167,6 @@ def test_transition__on_a_plant_of_ones_own_by_hand():
     np.testing.assert_allclose(after.history[:, 0, -1] / step_, counts, atol=1e-3)
     slope = 0.3 * (counts - before) * step_ / 0.05  # weights -3, -1, 1, 3 over 10
     np.testing.assert_allclose(after.history[:, 1, -1], slope, atol=1e-5)
-    ahead, behind = (
-        tool_position(forward_kinematics(BROKK_170, after.q + s * u)) for s in (1e-6, -1e-6)
-    )
-    np.testing.assert_allclose(after.v_tool, (ahead - behind) / 2e-6, atol=1e-5)
-    lowest = lowest_point(forward_kinematics(BROKK_170, after.q))
-    np.testing.assert_allclose(after.lowest, lowest, atol=1e-5)
     assert after.ticks == 1 and after.goal_ticks == state.goal_ticks - 1
     for name in ("history", "v_goal", "v_tool", "lowest"):
         assert getattr(after, name).dtype == np.float32, name

@@ -9,17 +9,9 @@ import numpy as np
 import pytest
 from helpers_machines import DRIVEN, POSE, opened, steady
 
-from brokk_min.env import Measured
-from brokk_min.jacobian import (
-    Gains,
-    JacobianController,
-    PIDState,
-    dls,
-    manipulability,
-    manipulability_threshold,
-)
+from brokk_min.jacobian import Gains, JacobianController, dls, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170
 
 GOAL = np.array([0.04, -0.03, 0.05])
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
@@ -40,23 +32,22 @@ def test_dls__by_hand():
 
 def test_manipulability_threshold__is_a_quarter_of_the_largest():
     poses = np.random.default_rng(0).uniform(LOW, HIGH, (2000, 5))
-    w = manipulability(jacobian(forward_kinematics(BROKK_170, poses))[..., DRIVEN])
+    driven = jacobian(forward_kinematics(BROKK_170, poses))[..., DRIVEN]
+    w = np.linalg.svd(driven, compute_uv=False).prod(axis=-1)
     assert manipulability_threshold(BROKK_170) == pytest.approx(w.max() / 4, rel=1e-6)
 
 
 # --- the controller -------------------------------------------------------------------------------
 
 
-def controller(w0=1e-6, k=0.1, machine: Machine = BROKK_170, **gains) -> JacobianController:
+def controller(w0=1e-6, k=0.1, machine=BROKK_170, **gains):
     n = len(machine.driven)
     arrays = {name: np.full(n, gains.get(name, 0.0)) for name in ("kp", "ki", "kd")}
     feedback = np.full(1, gains.get("feedback", 0.0))
     return JacobianController(machine, Gains(**arrays, feedback=feedback), k, w0)
 
 
-def drive(
-    c: JacobianController, inputs: list[Measured], state: PIDState | None = None
-) -> tuple[np.ndarray, list[PIDState]]:
+def drive(c, inputs, state=None):
     """Commands (ticks, n) of one controller, and its states, under one measurement a tick."""
     sent, states = [], [state or c.start(1)]
     for one in inputs:
@@ -83,12 +74,9 @@ def test_controller__first_tick_of_a_p_controller_by_hand():
     machine = replace(BROKK_170, name="own zones", joints=tuple(joints))
     c = controller(machine=machine, kp=1.5)
     q_dot = np.linalg.pinv(J) @ GOAL  # at rest all weights are 1
-    u, state = c(steady(POSE, GOAL, machine=machine), c.start(1))
+    u, _ = c(steady(POSE, GOAL, machine=machine), c.start(1))
     np.testing.assert_allclose(127 * u[0, DRIVEN], opened(1.5 * q_dot, 0.1, 0.2), atol=1e-9)
     assert q_dot.min() < -0.01 < 0.01 < q_dot.max() and u[0, 1] == 0
-    np.testing.assert_allclose(state.q_dot_goal[0], q_dot, atol=1e-6)
-    np.testing.assert_allclose(state.error[0], q_dot, atol=1e-6)
-    assert not state.integral.any()  # ki is 0
     moving = np.array([0.02, 0.0, -0.03, 0.01, 0.04])
     _, state = c(steady(POSE, GOAL, moving), c.start(1))
     np.testing.assert_allclose(state.error[0], q_dot - moving[DRIVEN], atol=1e-6)

@@ -1,7 +1,5 @@
 """Weighted damped least squares, its weights and its damping, where the controller runs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg
@@ -132,7 +130,7 @@ def test_limit_weights__are_above_1_towards_the_nearer_limit_alone(case):
     np.testing.assert_allclose(W, expected, rtol=1e-12)
 
 
-# --- damping --------------------------------------------------------------------------------------
+# --- damping, and all of it in the controller -----------------------------------------------------
 
 
 @given(posed())
@@ -152,9 +150,6 @@ def test_nakamura_damping__is_k_times_the_square_below_the_threshold(part, w0, k
     assert nakamura_damping(0.5 * w0, w0, k) == pytest.approx(k / 4)
 
 
-# --- all of it in the controller ------------------------------------------------------------------
-
-
 @given(moving(shapes=[(4,)]), npst.arrays(np.float64, (4, 3), elements=reals(-2, 2)), reals(0, 2))
 def test_joint_velocities__are_eq4_no_faster_than_the_joints(case, v, w0):
     """Weights by the directions of the tick before; all joints slow down by the same factor."""
@@ -165,14 +160,13 @@ def test_joint_velocities__are_eq4_no_faster_than_the_joints(case, v, w0):
     found = c.joint_velocities(v, q, last[:, driven])
     alone = c.joint_velocities(v[0], q[0], last[0, driven])
     np.testing.assert_allclose(alone, found[0], rtol=1e-9, atol=1e-12)
+    joints = [machine.joints[j] for j in driven]
     for i in range(4):
         J = jacobian(forward_kinematics(machine, q[i]))[:, driven]
         W = limit_weights(machine, q[i], last[i])[driven]
         damping = 0.1 * max(0, 1 - manipulability(J) / c.w0) ** 2 + 1e-9
         free = dls(J, W, damping) @ v[i]
-        limits = zip(free, driven, strict=True)
-        joints = [(x, machine.joints[j]) for x, j in limits]
-        fastest = [joint.q_dot_up if x > 0 else joint.q_dot_down for x, joint in joints]
-        factor = max(1.0, *(abs(x) / most for (x, _), most in zip(joints, fastest, strict=True)))
+        fastest = [j.q_dot_up if x > 0 else j.q_dot_down for x, j in zip(free, joints, strict=True)]
+        factor = max(1.0, np.max(np.abs(free) / fastest))
         np.testing.assert_allclose(found[i], free / factor, rtol=1e-6, atol=1e-9)
         assert np.all(np.abs(found[i]) <= np.array(fastest) * (1 + 1e-9))

@@ -1,7 +1,5 @@
 """Kinematics of any machine: an independent formula, derivatives, single precision."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from scipy.linalg import expm
