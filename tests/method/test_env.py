@@ -38,6 +38,8 @@ def test_action_to_pwm__by_hand():
     u = env.action_to_pwm(BROKK_170, [[0.5, -3.0, -0.01, 0.02], [1, 0, -1, 0]])
     np.testing.assert_allclose(u * 127, [[40, 0, -80, -1, 2], [80, 0, 0, -80, 0]], atol=1e-9)
     np.testing.assert_array_equal(env.action_to_pwm(BROKK_170, [1, 0, -1, 0]), u[1])
+    for kind in (np.float32, np.float64):
+        assert env.action_to_pwm(BROKK_170, np.ones(4, kind)).dtype == kind
 
 
 @pytest.mark.parametrize("action", [0.0, np.zeros(3), np.zeros((4, 1)), [0, np.nan, 0, np.inf]])
