@@ -17,7 +17,7 @@ from brokk_min.actuator import lever_arm
 from brokk_min.jacobian import dls, limit_weights
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_goal, draw_hold, draw_pose
-from brokk_min.machine import PWM_MAX, Array, Machine, require, valve_opening
+from brokk_min.machine import BROKK_170, PWM_MAX, Array, Machine, require, valve_opening
 from brokk_min.settings import TaskConfig
 
 AXES = "xyz"
@@ -154,13 +154,13 @@ def read_starts(path: Path, machine: Machine) -> Array:
 def evaluation_starts(
     machine: Machine, num: int, sequences: Sequence[Commands], seed: int
 ) -> Array:
-    """Start poses [rad] (num, n): the first of the file that the package has for the machine.
+    """Start poses [rad] (num, n): of the Brokk 170 the first of the package's file.
 
-    Without a file they are drawn. ValueError: more starts than the file has.
+    For other machines they are drawn. ValueError: more starts than the file has.
     """
-    path = SHIPPED / machine.name / "starts.csv"
-    if not path.exists():
+    if machine != BROKK_170:
         return draw_starts(machine, num, sequences, seed)
+    path = SHIPPED / machine.name / "starts.csv"
     starts = read_starts(path, machine)
     require(num <= len(starts), path.name, f"at most {len(starts)} starts", num)
     return starts[:num]

@@ -133,9 +133,9 @@ def test_evaluation_starts__of_the_package_are_those_of_reproduce():
         s.evaluation_starts(BROKK_170, 33, [], 0)
 
 
-def test_evaluation_starts__are_drawn_by_the_seed_for_a_machine_without_a_file():
+def test_evaluation_starts__are_drawn_by_the_seed_for_another_machine():
     short = [s.Commands("z", s.axis_sequences(BROKK_170)[2].goals[15:40])]
-    starts = s.evaluation_starts(replace(BROKK_170, name="other"), 5, short, 3)
+    starts = s.evaluation_starts(replace(BROKK_170, ground=-0.1), 5, short, 3)
     np.testing.assert_array_equal(s.draw_starts(BROKK_170, 3, short, 3), starts[:3])
     assert (s.draw_starts(BROKK_170, 5, short, 4) != starts).any()
 
