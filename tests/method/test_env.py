@@ -152,6 +152,16 @@ def test_the_table_of_the_docstring__is_true():
     assert all(text in env.__doc__ for text in ("(163,)", "Box(-1, 1, (4,))", "20 s"))
 
 
+def test_initial_state__is_at_rest():
+    """Two machines with one goal."""
+    state = env.initial_state(BROKK_170, [POSE, POSE], [0.1, 0.0, 0.0])
+    assert state.q.shape == state.q_dot.shape == (2, 5)
+    assert state.v_goal.shape == state.v_tool.shape == (2, 3)
+    assert state.ticks.shape == state.goal_ticks.shape == (2,)
+    assert not state.q_dot.any() and not state.v_tool.any() and not state.ticks.any()
+    assert state.v_goal.dtype == np.float32 and state.ticks.dtype == int
+
+
 def test_transition__on_a_plant_of_ones_own_by_hand():
     """A plant that obeys the command moves each joint by u x 50 ms; encoders count in steps."""
     u = np.float32([40, 0, -80, 13, 0]) / 127
@@ -162,6 +172,12 @@ def test_transition__on_a_plant_of_ones_own_by_hand():
     after = env.transition(BROKK_170, Obedient(), state, u)
     np.testing.assert_allclose(after.q, POSE + 0.05 * u, atol=1e-12)
     np.testing.assert_allclose(after.q_dot, u, atol=1e-12)
+    ahead, behind = (
+        tool_position(forward_kinematics(BROKK_170, after.q + s * u)) for s in (1e-6, -1e-6)
+    )
+    np.testing.assert_allclose(after.v_tool, (ahead - behind) / 2e-6, atol=1e-5)
+    lowest = lowest_point(forward_kinematics(BROKK_170, after.q))
+    np.testing.assert_allclose(after.lowest, lowest, atol=1e-5)
     np.testing.assert_array_equal(after.history[:, 2, -1], u)
     assert not after.history[:, 2, :-1].any()
     step_ = BROKK_170.encoder_step
