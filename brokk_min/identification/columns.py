@@ -20,13 +20,7 @@ from brokk_min.machine import Array, require
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 KINDS = ("u_", "q_")  # of columns that are read, beside run and time
-TABLES = (
-    ".csv",
-    ".npz",
-    ".mcap",
-    ".db3",
-    ".bag",
-)  # files that `load_table` reads, and folders of ROS
+TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # beside folders of ROS
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
 Mapped = dict[str, tuple[str, float]]  # column of the log: that of the file, and its factor
 

@@ -215,7 +215,7 @@ def _recordings(
 
 
 def _runs(names: Any) -> dict[str, Rows]:
-    """Rows of each recording, in the order in which they begin,"""
+    """Rows of each recording, in the order in which they begin."""
     unique, first, number = np.unique(names, return_index=True, return_inverse=True)
     return {str(unique[i]): np.flatnonzero(number == i) for i in np.argsort(first)}
 
