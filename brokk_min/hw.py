@@ -31,6 +31,10 @@ class Drive:
     `controller` is a policy or a baseline, with `start` and a call as `JacobianController` has.
     """
 
+    controller_state: Any  # from the first tick with all positions on
+    start_time: float  # s, see `begin`
+    lateness: float  # s, of the last tick
+
     def __init__(self, machine: Machine, controller: Any, bus: Bus, operator: Operator) -> None:
         self.machine, self.controller = machine, controller
         self.bus, self.operator = bus, operator
@@ -38,14 +42,11 @@ class Drive:
         self.nodes = canopen.Nodes(machine)
         self.gate = gate_start(machine)
         self.history: Array | None = None  # None after a gap
-        self.controller_state = controller.start(1)
         self.exception = ""  # of this tick
         self.last_exception = ""  # since it drove
         self.signals: list[int] = []
-        self.start_time = 0.0  # s
         self.deadline_number = 0  # ticks from the start to the next deadline
         self.ticks = 0
-        self.lateness = 0.0  # s
 
     def begin(self) -> None:
         """Set up and start the nodes, and start the clock. ValueError: an encoder does not fit."""

@@ -165,12 +165,13 @@ def test_initial_state__is_at_rest():
 def test_transition__on_a_plant_of_ones_own_by_hand():
     """A plant that obeys the command moves each joint by u x 50 ms; encoders count in steps."""
     u = np.float32([40, 0, -80, 13, 0]) / 127
-    state = env.initial_state(BROKK_170, POSE, ZERO, Obedient())
-    lowest = lowest_point(forward_kinematics(BROKK_170, POSE))
+    pose = POSE - [0, 0, 0.5, 0, 0]  # the tool is the lowest point, 0.2 m above the ground
+    state = env.initial_state(BROKK_170, pose, ZERO, Obedient())
+    lowest = lowest_point(forward_kinematics(BROKK_170, pose))
     assert state.lowest == pytest.approx(lowest, abs=1e-5)
     assert env.initial_state(BROKK_170, [1] * 5, ZERO).q.dtype == float and state.goal_ticks > 1e9
     after = env.transition(BROKK_170, Obedient(), state, u)
-    np.testing.assert_allclose(after.q, POSE + 0.05 * u, atol=1e-12)
+    np.testing.assert_allclose(after.q, pose + 0.05 * u, atol=1e-12)
     np.testing.assert_allclose(after.q_dot, u, atol=1e-12)
     ahead, behind = (
         tool_position(forward_kinematics(BROKK_170, after.q + s * u)) for s in (1e-6, -1e-6)
@@ -181,7 +182,7 @@ def test_transition__on_a_plant_of_ones_own_by_hand():
     np.testing.assert_array_equal(after.history[:, 2, -1], u)
     assert not after.history[:, 2, :-1].any()
     step_ = BROKK_170.encoder_step
-    before, counts = np.rint(POSE / step_), np.rint((POSE + 0.05 * u) / step_)
+    before, counts = np.rint(pose / step_), np.rint((pose + 0.05 * u) / step_)
     np.testing.assert_allclose(after.history[:, 0, -1] / step_, counts, atol=1e-3)
     slope = 0.3 * (counts - before) * step_ / 0.05  # weights -3, -1, 1, 3 over 10
     np.testing.assert_allclose(after.history[:, 1, -1], slope, atol=1e-5)

@@ -82,9 +82,17 @@ def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     assert trace.reward[half_second].mean() < 0.99  # there was something to lose
 
 
+def test_tick__survives_an_operator_that_fails_at_once(world):
+    """The first tick has a fault of its own before any other."""
+    world.drive.operator = raises(OSError("unplugged"))
+    assert world.drive.tick()
+    assert world.drive.reason == "error (OSError: unplugged)" and not world.drive.gate.armed_once
+
+
 def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
     world.operator.enable, out = False, []
     world.downward = recording(out)
+    assert world.drive.tick() and world.drive.reason == "tick late, or the clock was set"
     world.run(1.0)
     assert world.drive.gate.active_fault == 0
     assert {data for can_id, data in out if can_id == 0x080} == {b""}
@@ -215,6 +223,7 @@ def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world):
         stall = {40: 0.13, 80: 0.052, 90: 0.26}.get(k, 0.004)  # a tick takes some time
         world.controller.act = lambda stall=stall: world.sleep(stall)
         world.drive.tick()
+    assert world.drive.ticks == 120
     ticks = (np.array(world.syncs[1:]) - begun) / 0.05  # without that of the start
     late = np.flatnonzero(ticks - np.floor(ticks + 0.03) > 0.03)
     assert late.tolist() == [41, 81, 91]  # one tick at once after each stall, then the grid again
