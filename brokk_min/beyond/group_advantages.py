@@ -31,8 +31,7 @@ import torch
 from torch import Tensor
 
 from brokk_min import ppo
-from brokk_min.env import State
-from brokk_min.learning.episodes import map_arrays
+from brokk_min.learning.episodes import map_arrays, repeat
 from brokk_min.learning.gym_env import Step, TaskVectorEnv
 from brokk_min.machine import Array, require
 from brokk_min.settings import PPOConfig
@@ -41,46 +40,19 @@ COPIES = 4  # machines in a group; neighbours in each array
 LARGEST = 4.0  # deviations of all advantages, to which they are cut
 
 
-def repeat(values: Any) -> Any:
-    """Each row of a state or an array `COPIES` times."""
-    return map_arrays(lambda rows: np.repeat(rows, COPIES, axis=0), values)
-
-
 class GroupVectorEnv(TaskVectorEnv):
-    """A `TaskVectorEnv` of groups; its windows of `horizon` ticks end truncated.
+    """A `TaskVectorEnv` of groups, which share starts, goals and noise, and end together.
 
-    Their own last observations are in `info["final_obs"]`. ValueError: `num_envs` is no multiple
-    of `COPIES`.
+    Windows of `horizon` ticks end truncated; their own last observations are in
+    `info["final_obs"]`. ValueError: `num_envs` is no multiple of `COPIES`.
     """
+
+    copies = COPIES
 
     def __init__(self, num_envs: int, *options: Any, horizon: int, **more: Any) -> None:
         require(num_envs % COPIES == 0, "num_envs", f"a multiple of {COPIES}", num_envs)
         super().__init__(num_envs, *options, **more)
         self.horizon, self.ticks = horizon, 0
-
-    def draw_episodes(self, num: int) -> State:
-        """One start for each group."""
-        state: State = repeat(super().draw_episodes(num // COPIES))
-        return state
-
-    def draw_noise(self, num: int) -> Array:
-        """The same noise for all of a group."""
-        noise: Array = repeat(super().draw_noise(num // COPIES))
-        return noise
-
-    def new_goals(self, state: State) -> State:
-        """New goals for groups; their machines change goals at the same ticks."""
-        first = super().new_goals(map_arrays(lambda rows: rows[::COPIES], state))
-        return state._replace(v_goal=repeat(first.v_goal), goal_ticks=repeat(first.goal_ticks))
-
-    def step_without_reset(self, actions: Array) -> Step:
-        """The episode of a group ends where that of one of its machines does."""
-        obs, reward, terminated, truncated, info = super().step_without_reset(actions)
-        terminated, truncated = (
-            np.repeat(ends.reshape(-1, COPIES).any(axis=1), COPIES)
-            for ends in (terminated, truncated)
-        )
-        return obs, np.where(terminated, 0.0, reward), terminated, truncated & ~terminated, info
 
     def step(self, actions: Array) -> Step:
         """One tick; after the last of a window all of a group go on from one of them."""
@@ -88,9 +60,8 @@ class GroupVectorEnv(TaskVectorEnv):
         self.ticks += 1
         if self.ticks % self.horizon == 0:
             groups = np.arange(0, self.num_envs, COPIES)
-            rows = repeat(groups + self.np_random.integers(0, COPIES, len(groups)))
-            info |= {"final_obs": info.get("final_obs", obs)}
-            info |= {"_final_obs": np.ones_like(terminated)}
+            rows = repeat(groups + self.np_random.integers(0, COPIES, len(groups)), COPIES)
+            info = {"final_obs": obs} | info | {"_final_obs": np.ones_like(terminated)}
             truncated = ~terminated
             self.state, self.memory, obs = map_arrays(
                 lambda values: values[rows], (self.state, self.memory, obs)

@@ -24,6 +24,7 @@ from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Checkpoint, Rollout
 
 EVERY = 50  # updates between two checkpoints
+Rows = list[dict[str, float]]  # of a learning curve
 
 
 def train_policy(
@@ -37,25 +38,30 @@ def train_policy(
     training, or a number that is not finite. OSError: a file that cannot be written; the last
     checkpoint stays.
     """
-    about = {
-        "contract": contract(machine),
-        "actuator": fingerprint(net),
-        "seed": seed,
-        "recipe": asdict(recipe),
-    }
+    about = {"contract": contract(machine), "actuator": fingerprint(net)}
+    about |= {"seed": seed, "recipe": asdict(recipe)}
     torch.set_num_threads(1)  # several wait in vain on busy cores
-    config = recipe.learner
+    config, checkpoint = recipe.learner, Path(f"{out}.checkpoint")
     env, advantages, start = prepare(machine, net, recipe, seed)
-    log = TrainingLog(env, out, about)
-    if log.checkpoint.exists():
-        start = log.load(start)
+    rows: Rows = []
+    if checkpoint.exists():
+        start, rows = load(checkpoint, about, env, start)
+
+    def on_update(now: Checkpoint, rollout: Rollout, metrics: dict[str, float]) -> None:
+        error = float(np.mean([info["velocity_error"].mean() for info in rollout.infos]))
+        rows.append({"global_step": now.global_step, **metrics, "charts/velocity_error": error})
+        bar.update(now.global_step - bar.n)
+        bar.set_postfix_str(f"error {error:.3f} m/s")
+        if now.update % EVERY == 0 or now.global_step >= config.total_steps:
+            write_csv(Path(f"{out}.csv"), rows[0], [row.values() for row in rows])
+            save(checkpoint, about, env, now, rows)
+
     options: dict[str, Any] = {"initial": start.global_step, "unit_scale": True, "disable": None}
-    with tqdm(desc="train", total=config.total_steps, unit="step", **options) as log.bar:
-        agent = ppo.train(env, config, seed, advantages, log.on_update, start)
-    log.write_curve()
+    with tqdm(desc="train", total=config.total_steps, unit="step", **options) as bar:
+        agent = ppo.train(env, config, seed, advantages, on_update, start)
     policy = Policy(machine, about, actor_weights(agent), net, recipe.interface)
     save_policy(out, policy)
-    log.checkpoint.unlink(missing_ok=True)
+    checkpoint.unlink(missing_ok=True)
     return policy
 
 
@@ -90,67 +96,45 @@ def stagger_episodes(env: TaskVectorEnv) -> None:
     env.state = env.state._replace(ticks=np.where(low, 0, ticks))
 
 
-class TrainingLog:
-    """Curve, progress bar and checkpoints of one training."""
+def save(
+    path: Path, about: dict[str, Any], env: TaskVectorEnv, now: Checkpoint, rows: Rows
+) -> None:
+    """Write a checkpoint from which a training continues to the same bits."""
+    arrays: list[torch.Tensor] = []
+    map_arrays(lambda array: arrays.append(torch.tensor(array)), (env.state, env.memory))
+    content = {
+        "about": json.dumps(about),
+        "agent": now.agent.state_dict(),
+        "optimizer": now.optimizer.state_dict(),
+        "obs": now.obs,
+        "steps": [now.global_step, now.update],
+        "torch_random": torch.get_rng_state(),
+        "numpy_random": env.np_random.bit_generator.state,
+        "arrays": arrays,
+        "rows": rows,
+    }
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    with whole_file(path) as file:
+        file.write(buffer.getvalue())
 
-    bar: "tqdm[Any]"
 
-    def __init__(self, env: TaskVectorEnv, out: Path, about: dict[str, Any]) -> None:
-        self.env, self.about = env, about
-        self.checkpoint = Path(f"{out}.checkpoint")
-        self.curve = Path(f"{out}.csv")
-        self.rows: list[dict[str, float]] = []
+def load(
+    path: Path, about: dict[str, Any], env: TaskVectorEnv, fresh: Checkpoint
+) -> tuple[Checkpoint, Rows]:
+    """The training of a checkpoint and its curve, in place of a fresh one of the same settings.
 
-    def on_update(self, now: Checkpoint, rollout: Rollout, metrics: dict[str, float]) -> None:
-        """Add a row to the curve; every `EVERY` updates write a checkpoint."""
-        error = float(np.mean([info["velocity_error"].mean() for info in rollout.infos]))
-        row = {"global_step": now.global_step, **metrics, "charts/velocity_error": error}
-        self.rows.append(row)
-        self.bar.update(now.global_step - self.bar.n)
-        self.bar.set_postfix_str(f"error {error:.3f} m/s")
-        if now.update % EVERY == 0:
-            self.write_curve()
-            self.save(now)
-
-    def write_curve(self) -> None:
-        """Write all rows so far."""
-        write_csv(self.curve, self.rows[0], [row.values() for row in self.rows])
-
-    def save(self, now: Checkpoint) -> None:
-        """Write a checkpoint from which a training continues to the same bits."""
-        arrays: list[torch.Tensor] = []
-        simulation = self.env.state, self.env.memory
-        map_arrays(lambda array: arrays.append(torch.tensor(array)), simulation)
-        content = {
-            "about": json.dumps(self.about),
-            "agent": now.agent.state_dict(),
-            "optimizer": now.optimizer.state_dict(),
-            "obs": now.obs,
-            "steps": [now.global_step, now.update],
-            "torch_random": torch.get_rng_state(),
-            "numpy_random": self.env.np_random.bit_generator.state,
-            "arrays": arrays,
-            "rows": self.rows,
-        }
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        with whole_file(self.checkpoint) as file:
-            file.write(buffer.getvalue())
-
-    def load(self, fresh: Checkpoint) -> Checkpoint:
-        """The training of the checkpoint, in place of a fresh one of the same settings.
-
-        ValueError: no checkpoint, or one of another training, with the first difference.
-        """
-        with expected(self.checkpoint, "a readable checkpoint"):
-            content = torch.load(self.checkpoint, weights_only=True)  # executes nothing
-            expect_same(self.checkpoint, json.loads(content["about"]), self.about)
-            fresh.agent.load_state_dict(content["agent"])
-            fresh.optimizer.load_state_dict(content["optimizer"])
-            arrays = iter(content["arrays"])
-            simulation = self.env.state, self.env.memory
-            self.env.state, self.env.memory = map_arrays(lambda _: next(arrays).numpy(), simulation)
-            self.env.np_random.bit_generator.state = content["numpy_random"]
-            torch.set_rng_state(content["torch_random"])
-            self.rows = content["rows"]
-            return Checkpoint(fresh.agent, fresh.optimizer, content["obs"], *content["steps"])
+    ValueError: no checkpoint, or one of another training, with the first difference.
+    """
+    with expected(path, "a readable checkpoint"):
+        content = torch.load(path, weights_only=True)  # executes nothing
+        expect_same(path, json.loads(content["about"]), about)
+        fresh.agent.load_state_dict(content["agent"])
+        fresh.optimizer.load_state_dict(content["optimizer"])
+        arrays = iter(content["arrays"])
+        simulation = env.state, env.memory
+        env.state, env.memory = map_arrays(lambda _: next(arrays).numpy(), simulation)
+        env.np_random.bit_generator.state = content["numpy_random"]
+        torch.set_rng_state(content["torch_random"])
+        now = Checkpoint(fresh.agent, fresh.optimizer, content["obs"], *content["steps"])
+        return now, content["rows"]

@@ -49,15 +49,16 @@ def reset(
 
 
 def new_goals(
-    machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator
+    machine: Machine, config: TaskConfig, state: State, rng: np.random.Generator, copies: int = 1
 ) -> State:
-    """New goals where the time of a goal is over."""
+    """New goals where the time of a goal is over, each for `copies` neighbours."""
     rows = np.flatnonzero(state.goal_ticks <= 0)
     if not len(rows):
         return state
+    num = len(rows) // copies
     v_goal, goal_ticks = state.v_goal.copy(), state.goal_ticks.copy()
-    v_goal[rows] = draw_goal(machine, config, rng, len(rows))
-    goal_ticks[rows] = draw_hold(machine, config, rng, len(rows))
+    v_goal[rows] = repeat(draw_goal(machine, config, rng, num), copies)
+    goal_ticks[rows] = repeat(draw_hold(machine, config, rng, num), copies)
     return state._replace(v_goal=v_goal, goal_ticks=goal_ticks)
 
 
@@ -76,6 +77,11 @@ def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
         values = [map_arrays(function, *row) for row in zip(first, *others, strict=True)]
         return first._make(values) if hasattr(first, "_make") else tuple(values)
     return function(first, *others)
+
+
+def repeat(values: Any, copies: int) -> Any:
+    """Each row of `values` so many times; values as for `map_arrays`."""
+    return map_arrays(lambda rows: np.repeat(rows, copies, axis=0), values)
 
 
 def replace_rows(values: Any, rows: NDArray[np.intp], fresh: Any) -> Any:

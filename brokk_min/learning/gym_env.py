@@ -6,7 +6,6 @@ Importing this module registers them, and Gymnasium can import it by the name of
     gymnasium.make_vec("brokk_min.learning.gym_env:brokk_min/Brokk170-v0", num_envs=256)
 """
 
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -20,7 +19,7 @@ from brokk_min import env
 from brokk_min._files import brief
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import PAPER, Interface, State, measure
-from brokk_min.learning.episodes import draw_noise, new_goals, replace_rows, reset
+from brokk_min.learning.episodes import draw_noise, new_goals, repeat, replace_rows, reset
 from brokk_min.machine import BROKK_170, Array, Machine, require
 from brokk_min.settings import TaskConfig
 
@@ -37,10 +36,11 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     observation of an episode where `info["_final_obs"]` is set.
 
     Gymnasium's `AutoresetMode` explains when an ended episode resets; its vector wrappers of
-    observations accept NEXT_STEP. `max_episode_steps` counts ticks and stands for the seconds of
-    `config`. The mode "rgb_array" renders the first machine. ValueError: an argument that is wrong.
+    observations accept NEXT_STEP. The mode "rgb_array" renders the first machine. ValueError: an
+    argument that is wrong.
     """
 
+    copies = 1  # neighbours that share starts, goals, noise and ends: `beyond.group_advantages`
     state: State
     memory: Any  # of the agent
     obs: Array
@@ -54,14 +54,11 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         interface: Interface = PAPER,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-        max_episode_steps: int | None = None,
     ) -> None:
         require(num_envs > 0, "num_envs", "1 or more", num_envs)
         require(isinstance(machine, Machine), "machine", "a Machine", machine)
         require(isinstance(config, TaskConfig), "config", "a TaskConfig", config)
         require(hasattr(plant, "step"), "plant", "reset and step", brief(plant))
-        if max_episode_steps is not None:
-            config = replace(config, episode_s=max_episode_steps / machine.rate)
         rate, mode = round(machine.rate), AutoresetMode(autoreset_mode)
         self.metadata = TaskEnv.metadata | {"render_fps": rate, "autoreset_mode": mode}
         self.num_envs, self.plant, self.machine, self.config = num_envs, plant, machine, config
@@ -81,8 +78,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         ValueError: a mask of another shape or type.
         """
         super().reset(seed=seed)
-        mask = (options or {}).get("reset_mask")
-        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         fits = mask.shape == (self.num_envs,) and mask.dtype == bool
         require(fits, "reset_mask", f"{self.num_envs} booleans", brief(mask.tolist()))
         self.begin_episodes(mask)
@@ -91,7 +87,9 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     def begin_episodes(self, mask: Bools) -> None:
         """Draw new episodes where `mask` is true; others go on."""
         rows = np.flatnonzero(mask)
-        state = self.draw_episodes(len(rows))
+        num = len(rows) // self.copies
+        state = reset(self.machine, self.config, self.np_random, num, self.plant)
+        state = repeat(state, self.copies)
         obs, memory = self.observe(state, None)
         fresh = state, memory, obs
         if len(rows) < self.num_envs:
@@ -99,22 +97,11 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self.state, self.memory, self.obs = fresh
         self.ended = self.ended & ~mask
 
-    def draw_episodes(self, num: int) -> State:
-        """`num` machines at the start of an episode."""
-        return reset(self.machine, self.config, self.np_random, num, self.plant)
-
-    def draw_noise(self, num: int) -> Array:
-        """Noise of `env.measure` for `num` machines."""
-        return draw_noise(self.machine, self.config.noise, num, self.np_random)
-
-    def new_goals(self, state: State) -> State:
-        """New goals where the time of a goal is over."""
-        return new_goals(self.machine, self.config, state, self.np_random)
-
     def observe(self, state: State, memory: Any) -> tuple[Array, Any]:
         """Observation with fresh noise (5 % in the paper), and the agent's memory with it."""
         m = self.machine
-        measured = measure(m, state.history, state.v_goal, self.draw_noise(len(state.q)))
+        noise = draw_noise(m, self.config.noise, len(state.q) // self.copies, self.np_random)
+        measured = measure(m, state.history, state.v_goal, repeat(noise, self.copies))
         memory = self.interface.remember(m, memory, measured)
         return self.interface.observe(m, measured, memory), memory
 
@@ -138,13 +125,17 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         m, memory, u_before = self.machine, self.memory, self.state.history[..., 2, -1]
         u = self.interface.command(m, np.asarray(actions), memory)
         state, reward, terminated, truncated = env.step(m, self.config, self.plant, self.state, u)
+        terminated, truncated = (
+            repeat(ends.reshape(-1, self.copies).any(axis=1), self.copies)
+            for ends in (terminated, truncated)
+        )
         error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
         info = {"velocity_error": error, "new_goal": state.goal_ticks <= 0}
-        self.state = self.new_goals(state)
+        self.state = new_goals(m, self.config, state, self.np_random, self.copies)
         self.obs, self.memory = self.observe(self.state, memory)
         cost = self.interface.cost(m, u, u_before, self.memory)
         reward = np.where(terminated, 0.0, reward - cost)
-        return self.obs, reward, terminated, truncated, info
+        return self.obs, reward, terminated, truncated & ~terminated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """A picture of the first machine (height, width, 3), with goal and tool velocity."""

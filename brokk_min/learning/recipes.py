@@ -1,6 +1,6 @@
 """Settings of our agent and of the paper's. It imports no torch, so that `--help` is quick."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from brokk_min.settings import PPOConfig, TaskConfig
 
@@ -24,13 +24,7 @@ def find_recipe(paper: bool = False, critic: bool = False) -> Recipe:
     elif paper:
         learner = PPOConfig(75_000_000, gamma=0.95, gae_lambda=1.0, log_std_end=-4.2)
     else:
-        learner = PPOConfig(
-            11_000_000,
-            learning_rate=2e-3,
-            target_kl=0.06,
-            gamma=0.94,
-            gae_lambda=1.0,
-            log_std_end=-4.0,
-        )
+        learner = PPOConfig(11_000_000, gamma=0.94, gae_lambda=1.0, log_std_end=-4.0)
+        learner = replace(learner, learning_rate=2e-3, target_kl=0.06)
     muon = not (paper or critic)
     return Recipe("paper" if paper else "beyond", critic, task, learner, muon)
