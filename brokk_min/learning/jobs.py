@@ -4,7 +4,6 @@ A cluster is the address of a scheduler, `tcp://...`. Its workers must have this
 folder that the calls write to, and one thread each, because torch's settings hold for a process.
 """
 
-import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +15,8 @@ from tqdm import tqdm
 
 from brokk_min.machine import require
 
-TIMEOUT = 10  # s, in which a scheduler must answer
+HOST = "127.0.0.1"  # of a scheduler of our own: no other computer can reach it
+TIMEOUT = 10  # s, in which the scheduler of a cluster must answer
 
 
 def side_by_side(
@@ -36,13 +36,10 @@ def side_by_side(
         for name, call in calls.items():
             results = [jobs[other] for other in (needs or {}).get(name, ())]
             jobs[name] = client.submit(call, *results, pure=False, priority=-len(jobs))
-        names = {job.key: name for name, job in jobs.items()}
-        done = {}
-        bar = tqdm(as_completed(jobs.values()), total=len(jobs), unit="job", disable=None)  # type: ignore[no-untyped-call]
-        for job in bar:
-            done[names[job.key]] = job.result()
-            bar.set_postfix_str(f"last: {names[job.key]}")
-        return {name: done[name] for name in calls}
+        ended = as_completed(jobs.values(), with_results=True)  # type: ignore[no-untyped-call]
+        bar = tqdm(ended, total=len(jobs), unit="job", disable=None)
+        done = {job.key: result for job, result in bar}
+        return {name: done[job.key] for name, job in jobs.items()}
 
 
 @contextmanager
@@ -55,11 +52,9 @@ def connect(scheduler: str | None, workers: int) -> Iterator[Any]:
     from distributed import Client  # slow to import
 
     options: dict[str, Any] = {"address": scheduler, "timeout": TIMEOUT}
-    if scheduler is None:  # all ports are on this machine's own address
-        local = "127.0.0.1"
+    if scheduler is None:
         options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": None}
-        options |= {"host": local, "dashboard_address": f"{local}:0"}
-        options |= {"silence_logs": logging.CRITICAL}
+        options |= {"host": HOST, "dashboard_address": f"{HOST}:0", "silence_logs": "CRITICAL"}
     environ = "distributed.nanny.pre-spawn-environ"  # of the processes that run the calls
     settings = {
         f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times

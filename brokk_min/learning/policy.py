@@ -63,16 +63,17 @@ class Policy:
 
 def contract(machine: Machine) -> dict[str, Any]:
     """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
-    names = ("history", "rate", "velocity_samples", "pwm_limit")
+    joints = machine.joints
     return {
         "machine": machine.name,
         "joints": list(machine.names),
         "driven": [machine.names[i] for i in machine.driven],
-        **{name: getattr(machine, name) for name in names},
+        "history": machine.history,
+        "rate": machine.rate,
+        "velocity_samples": machine.velocity_samples,
+        "pwm_limit": machine.pwm_limit,
         "dead_zones": machine.dead_zones.tolist(),
-        "geometry": [
-            [j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max, j.kind] for j in machine.joints
-        ],
+        "geometry": [[j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max, j.kind] for j in joints],
     }
 
 
@@ -105,6 +106,4 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         require(fits, str(path), wanted, "another")
         weights = tuple(arrays[f"layer_{i}"] for i in range(8))
         net = select_nets(machine, net_from_arrays(path, header["net"], arrays))
-        policy = Policy(machine, header["training"], weights, net, header["interface"])
-        policy.act(np.zeros((1, len(mean))))  # do shapes fit?
-        return policy
+        return Policy(machine, header["training"], weights, net, header["interface"])
