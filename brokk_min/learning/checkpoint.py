@@ -38,7 +38,7 @@ def train_policy(
     training, or a number that is not finite. OSError: a file that cannot be written; the last
     checkpoint stays.
     """
-    about = {"contract": contract(machine), "actuator": fingerprint(net)}
+    about: dict[str, Any] = {"contract": contract(machine), "actuator": fingerprint(net)}
     about |= {"seed": seed, "recipe": asdict(recipe)}
     torch.set_num_threads(1)  # several wait in vain on busy cores
     config, checkpoint = recipe.learner, Path(f"{out}.checkpoint")

@@ -16,7 +16,6 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from brokk_min import env
-from brokk_min._files import brief
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import PAPER, Interface, State, measure
 from brokk_min.learning.episodes import draw_noise, new_goals, repeat, replace_rows, reset
@@ -58,7 +57,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         require(num_envs > 0, "num_envs", "1 or more", num_envs)
         require(isinstance(machine, Machine), "machine", "a Machine", machine)
         require(isinstance(config, TaskConfig), "config", "a TaskConfig", config)
-        require(hasattr(plant, "step"), "plant", "reset and step", brief(plant))
+        require(hasattr(plant, "step"), "plant", "reset and step", plant)
         rate, mode = round(machine.rate), AutoresetMode(autoreset_mode)
         self.metadata = TaskEnv.metadata | {"render_fps": rate, "autoreset_mode": mode}
         self.num_envs, self.plant, self.machine, self.config = num_envs, plant, machine, config
@@ -68,7 +67,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self.single_action_space = Box(-1.0, 1.0, (len(machine.driven),), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.ended = np.zeros(num_envs, bool)  # episodes that wait for their reset
+        self.waiting = np.zeros(num_envs, bool)  # episodes that begin in the next step
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -80,7 +79,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         super().reset(seed=seed)
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         fits = mask.shape == (self.num_envs,) and mask.dtype == bool
-        require(fits, "reset_mask", f"{self.num_envs} booleans", brief(mask.tolist()))
+        require(fits, "reset_mask", f"{self.num_envs} booleans", f"{mask.dtype} {mask.shape}")
         self.begin_episodes(mask)
         return self.obs, {}
 
@@ -90,12 +89,11 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         num = len(rows) // self.copies
         state = reset(self.machine, self.config, self.np_random, num, self.plant)
         state = repeat(state, self.copies)
-        obs, memory = self.observe(state, None)
-        fresh = state, memory, obs
+        fresh = state, *self.observe(state, None)
         if len(rows) < self.num_envs:
-            fresh = replace_rows((self.state, self.memory, self.obs), rows, fresh)
-        self.state, self.memory, self.obs = fresh
-        self.ended = self.ended & ~mask
+            fresh = replace_rows((self.state, self.obs, self.memory), rows, fresh)
+        self.state, self.obs, self.memory = fresh
+        self.waiting = self.waiting & ~mask
 
     def observe(self, state: State, memory: Any) -> tuple[Array, Any]:
         """Observation with fresh noise (5 % in the paper), and the agent's memory with it."""
@@ -107,35 +105,28 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
 
     def step(self, actions: Array) -> Step:
         """One tick of all machines under actions (num_envs, n_driven)."""
-        obs, reward, terminated, truncated, info = self.step_without_reset(actions)
-        mode, begin = self.metadata["autoreset_mode"], self.ended
-        if mode == AutoresetMode.NEXT_STEP and begin.any():
-            self.begin_episodes(begin)
-            reward = np.where(begin, 0.0, reward)
-            terminated, truncated = terminated & ~begin, truncated & ~begin
-        self.ended = terminated | truncated
-        if mode == AutoresetMode.SAME_STEP and self.ended.any():
-            info |= {"final_obs": obs, "_final_obs": self.ended}
-            self.begin_episodes(self.ended)
-        return self.obs, reward, terminated, truncated, info
-
-    def step_without_reset(self, actions: Array) -> Step:
-        """`step` in which ended episodes go on."""
         require(hasattr(self, "state"), "step", "a reset before the first step", "none")
-        m, memory, u_before = self.machine, self.memory, self.state.history[..., 2, -1]
-        u = self.interface.command(m, np.asarray(actions), memory)
-        state, reward, terminated, truncated = env.step(m, self.config, self.plant, self.state, u)
-        terminated, truncated = (
-            repeat(ends.reshape(-1, self.copies).any(axis=1), self.copies)
-            for ends in (terminated, truncated)
-        )
+        m, begin, u_before = self.machine, self.waiting, self.state.history[..., 2, -1]
+        u = self.interface.command(m, np.asarray(actions), self.memory)
+        state, reward, *ends = env.step(m, self.config, self.plant, self.state, u)
         error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
         info = {"velocity_error": error, "new_goal": state.goal_ticks <= 0}
         self.state = new_goals(m, self.config, state, self.np_random, self.copies)
-        self.obs, self.memory = self.observe(self.state, memory)
+        self.obs, self.memory = self.observe(self.state, self.memory)
         cost = self.interface.cost(m, u, u_before, self.memory)
-        reward = np.where(terminated, 0.0, reward - cost)
-        return self.obs, reward, terminated, truncated & ~terminated, info
+
+        of_groups = np.reshape(ends, (2, -1, self.copies)).any(axis=-1)
+        terminated, truncated = of_groups.repeat(self.copies, axis=-1) & ~begin
+        truncated = truncated & ~terminated
+        reward = np.where(terminated | begin, 0.0, reward - cost)
+        ended, mode = terminated | truncated, self.metadata["autoreset_mode"]
+        if begin.any():
+            self.begin_episodes(begin)
+        if mode == AutoresetMode.SAME_STEP and ended.any():
+            info |= {"final_obs": self.obs, "_final_obs": ended}
+            self.begin_episodes(ended)
+        self.waiting = ended & (mode == AutoresetMode.NEXT_STEP)
+        return self.obs, reward, terminated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """A picture of the first machine (height, width, 3), with goal and tool velocity."""
@@ -147,11 +138,12 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
 
 
 class TaskEnv(gymnasium.Env[Array, Array]):
-    """One machine: a `TaskVectorEnv` of one, by its options, whose episodes the caller resets."""
+    """One machine, which the caller resets: a `TaskVectorEnv` of one, by its options."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
+        options |= {"autoreset_mode": AutoresetMode.DISABLED}
         self.vector = TaskVectorEnv(1, *arguments, **options)
         self.metadata, self.render_mode = self.vector.metadata, self.vector.render_mode
         self.observation_space = self.vector.single_observation_space
@@ -168,8 +160,7 @@ class TaskEnv(gymnasium.Env[Array, Array]):
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One tick under the action (n_driven,)."""
-        actions = np.asarray(action)[None]
-        obs, reward, terminated, truncated, info = self.vector.step_without_reset(actions)
+        obs, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
         info = {name: value[0] for name, value in info.items()}
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 

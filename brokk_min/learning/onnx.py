@@ -7,6 +7,7 @@ import torch
 
 from brokk_min._files import require_package, whole_file
 from brokk_min.learning.policy import INTERFACES, Policy, contract
+from brokk_min.ppo import mlp
 
 TABLES = {"paper": "brokk_min/env.py", "beyond": "brokk_min/beyond/interface.py"}
 
@@ -19,14 +20,13 @@ def export_onnx(path: Path, policy: Policy) -> None:
     ValueError: the package onnxscript is not installed.
     """
     require_package("onnxscript", "export")
-    layers: list[torch.nn.Module] = []
-    for w, b in zip(policy.weights[::2], policy.weights[1::2], strict=True):
-        linear = torch.nn.Linear(*w.shape)
-        linear.weight.data, linear.bias.data = torch.tensor(w.T), torch.tensor(b)
-        layers += [linear, torch.nn.ELU()]
+    size = len(policy.weights[0])
+    actor = mlp(size, len(policy.weights[-1]), 1.0).eval()
+    for parameter, weight in zip(actor.parameters(), policy.weights, strict=True):
+        parameter.data = torch.tensor(weight.T)
     program = torch.onnx.export(
-        torch.nn.Sequential(*layers[:-1]).eval(),  # no ELU after the last layer
-        (torch.zeros(2, len(policy.weights[0])),),
+        actor,
+        (torch.zeros(2, size),),
         input_names=["observation"],
         output_names=["action"],
         dynamic_shapes=({0: torch.export.Dim("batch")},),

@@ -5,7 +5,6 @@ Everything is drawn twice as large and then scaled down, so that edges are smoot
 pixels, and y points down.
 """
 
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -38,7 +37,6 @@ class Scene(NamedTuple):
     title: str = ""
     status: str = ""
     colour: Colour = BLUE
-    notes: Sequence[str] = ()
 
 
 def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
@@ -52,7 +50,9 @@ def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
         _tool(pen, machine, view, scene)
         image.paste(part, view.corner)
     pen = ImageDraw.Draw(image)
-    _captions(pen, machine, scene, image.size)
+    pen.regular_polygon((36, HEAD / 2, 12), 24, fill=scene.colour)
+    pen.text((60, HEAD / 2), scene.title, INK, _font(30), "lm")
+    pen.text((image.width - 28, HEAD / 2), scene.status, MUTED, _font(26), "rm")
     for i in range(machine.n):
         _joint_row(pen, machine, scene, i, image.size)
     return image.reduce(2)
@@ -82,7 +82,7 @@ class View(NamedTuple):
 def views(machine: Machine, q: Array, size: tuple[int, int]) -> list[View]:
     """From the side, in the vertical plane of the tool, and from above, with x up and y left."""
     reach, low, high = extent(machine)
-    width, height = round(0.6 * size[0]), size[1] - HEAD - foot(machine)
+    width, height = round(0.6 * size[0]), size[1] - HEAD - round(ROW * (machine.n + 0.5))
     x, y, _ = tool_position(forward_kinematics(machine, q))
     heading = np.arctan2(y, x)
     out_and_up = np.array([[np.cos(heading), np.sin(heading), 0.0], [0.0, 0.0, 1.0]])
@@ -92,11 +92,6 @@ def views(machine: Machine, q: Array, size: tuple[int, int]) -> list[View]:
     rest = size[0] - width
     scale, middle = min(rest, height) / (2.1 * reach), np.array([rest / 2, height / 2])
     return [side, View("top view", (width, HEAD), (rest, height), middle, scale, ABOVE)]
-
-
-def foot(machine: Machine) -> int:
-    """Height of the rows of all joints, or of five notes, below the views."""
-    return ROW * max(machine.n, 5) + ROW // 2
 
 
 @lru_cache
@@ -139,7 +134,11 @@ def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     pen.line(view.project(scene.trail).ravel().tolist(), scene.colour, 5)
     pen.regular_polygon((*tip, 8), 24, fill=INK)
     scale = 0.2 * min(view.size) / machine.tool_speed
-    for v, colour in ((scene.v_tool, MEASURED), (scene.v_goal, INK)):
+    arrows = ((52, "measured", scene.v_tool, MEASURED), (20, "goal", scene.v_goal, INK))
+    for y, name, v, colour in arrows:
+        if view.axes is not ABOVE:
+            text = f"{name} {np.linalg.norm(v):.2f} m/s"
+            pen.text((view.size[0] - 20, y), text, colour, _font(24), "rm")
         along = scale * (view.axes @ v) * (1, -1)
         if (length := float(np.hypot(*along))) > 8:
             head = min(22.0, 0.7 * length) * along / length
@@ -149,26 +148,12 @@ def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
             pen.polygon([*tip + along, *neck + barb, *neck - barb], colour)
 
 
-def _captions(pen: Pen, machine: Machine, scene: Scene, size: tuple[int, int]) -> None:
-    """Title, status, the meaning of the arrows, and notes beside the rows of the joints."""
-    width, height = size
-    pen.regular_polygon((36, HEAD / 2, 12), 24, fill=scene.colour)
-    pen.text((60, HEAD / 2), scene.title, INK, _font(30), "lm")
-    pen.text((width - 28, HEAD / 2), scene.status, MUTED, _font(26), "rm")
-    for y, name, v in ((20, "goal", scene.v_goal), (52, "measured", scene.v_tool)):
-        text, colour = f"{name} {np.linalg.norm(v):.2f} m/s", MEASURED if y > 20 else INK
-        pen.text((0.6 * width - 20, HEAD + y), text, colour, _font(24), "rm")
-    for i, note in enumerate(scene.notes):
-        below = height - foot(machine) + ROW * (i + 0.75)
-        pen.text((0.58 * width, below), note, INK, _font(24), "lm")
-
-
 def _joint_row(pen: Pen, machine: Machine, scene: Scene, i: int, size: tuple[int, int]) -> None:
     """The angle of joint i within its range, and its command within the limit."""
     joint, q = machine.joints[i], float(scene.q[i])
-    y = size[1] - foot(machine) + ROW * (i + 0.75)
+    y = size[1] - ROW * (machine.n - i - 0.25)
     left = 40 + 18 * max(map(len, machine.names))
-    length = (0.54 * size[0] - left - 320) / 2  # of a bar, beside the digits
+    length = (size[0] - left - 340) / 2  # of a bar, beside the digits
     colour, font = INK if joint.driven else MUTED, _font(24)
     unit = "rad" if joint.kind == "revolute" else "m"
     pen.text((28, y), joint.name, colour, font, "lm")

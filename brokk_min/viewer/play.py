@@ -7,8 +7,6 @@ depends on timing.
 
 import os
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -22,7 +20,7 @@ from brokk_min.can.simulated_machine import start_pose
 from brokk_min.env import initial_state, measure, transition
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Machine, require
 from brokk_min.viewer.drawing import BLUE, ORANGE, Scene, draw
 
 SIZE = (1120, 680)  # px, of the window
@@ -31,13 +29,7 @@ TRAIL = 600  # positions of the tool that are shown
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
 AXES = (1, 0, 3)
 Y_BUTTON = 3  # of an Xbox pad
-NOTES = (
-    "arrows: x (up, down) and y (left, right)",
-    "W, S: z (up, down)    left SHIFT: slowly",
-    "TAB: the other controller",
-    "ESC: end",
-    "gamepad: both sticks; Y is TAB",
-)
+HELP = "arrows, W, S: move    left SHIFT: slowly    TAB: the other controller    ESC: end"
 
 
 class Operator:
@@ -59,8 +51,6 @@ class Operator:
             return "other"
         if event.type == pg.CONTROLLERDEVICEADDED:
             self.pad = self.gamepads.Controller(event.device_index)
-        elif event.type == pg.CONTROLLERDEVICEREMOVED:
-            self.pad = None
         return ""
 
     def velocity(self) -> Array:
@@ -85,7 +75,7 @@ class Session:
     def __post_init__(self) -> None:
         q = start_pose(self.machine)[None]
         self.state = initial_state(self.machine, q, np.zeros(3), self.plant)
-        self.trail = self.tool[None]
+        self.trail: deque[Array] = deque(maxlen=TRAIL)  # of the tool [m]
         self.names = deque(self.controllers)  # the first one drives
         self.memory = self.controllers[self.names[0]].start(1)
 
@@ -94,26 +84,17 @@ class Session:
         self.names.rotate(-1)
         self.memory = self.controllers[self.names[0]].start(1)
 
-    @property
-    def tool(self) -> Array:
-        """Position of the tool now [m], (3,)."""
-        return tool_position(forward_kinematics(self.machine, self.state.q[0]))
-
-    def tick(self, v_goal: Array) -> None:
+    def tick(self, v_goal: Array) -> Scene:
         """Controller and plant go on by a tick, with this goal velocity [m/s] (3,)."""
         self.state = self.state._replace(v_goal=v_goal.astype(np.float32)[None])
         measured = measure(self.machine, self.state.history, self.state.v_goal)
         u, self.memory = self.controllers[self.names[0]](measured, self.memory)
-        self.state = transition(self.machine, self.plant, self.state, u)
-        self.trail = np.vstack([self.trail, self.tool])[-TRAIL:]
-
-    def scene(self) -> Scene:
-        """What the window shows now."""
-        s = self.state
+        self.state = s = transition(self.machine, self.plant, self.state, u)
+        self.trail.append(tool_position(forward_kinematics(self.machine, s.q[0])))
         status = f"{s.ticks[0] * self.machine.dt:.1f} s"
         colour = BLUE if self.names[0] == next(iter(self.controllers)) else ORANGE
-        tool = s.v_goal[0], s.v_tool[0], self.trail
-        return Scene(s.q[0], s.history[0, :, 2, -1], *tool, self.names[0], status, colour, NOTES)
+        tool = s.v_goal[0], s.v_tool[0], np.array(self.trail)
+        return Scene(s.q[0], u[0], *tool, self.names[0], status, colour)
 
 
 def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PLANT) -> None:
@@ -121,46 +102,37 @@ def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PL
 
     The window shows the names of the `controllers`. ValueError: no pygame, or no display.
     """
-    with window(f"brokk_min: {machine.name}") as pygame:
-        session, operator = Session(machine, controllers, plant), Operator(machine, pygame)
-        clock = pygame.time.Clock()
-        while True:
-            for event in pygame.event.get():
-                action = operator.handle(event)
-                if action == "close":
-                    return
-                if action == "other":
-                    session.switch()
-            session.tick(operator.velocity())
-            show(pygame, machine, session.scene())
-            clock.tick(machine.rate)
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    pygame = require_package("pygame", "play")
+    window = open_window(pygame)
+    session, operator = Session(machine, controllers, plant), Operator(machine, pygame)
+    clock = pygame.time.Clock()
+    while True:
+        for event in pygame.event.get():
+            action = operator.handle(event)
+            if action == "close":
+                pygame.display.quit()
+                return
+            if action == "other":
+                session.switch()
+        scene = session.tick(operator.velocity())
+        pixels = draw(machine, scene, SIZE).tobytes()
+        window.blit(pygame.image.frombytes(pixels, SIZE, "RGB"), (0, 0))
+        pygame.display.flip()
+        clock.tick(machine.rate)
 
 
-@contextmanager
-def window(title: str) -> Iterator[Any]:
-    """An open window, as the module pygame.
+def open_window(pygame: Any) -> Any:
+    """The surface of a new window.
 
     Without a display SDL would draw unseen; that is refused unless SDL_VIDEODRIVER asks for it.
     """
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    pygame = require_package("pygame", "play")
     try:
         pygame.display.init()
-        pygame.display.set_mode(SIZE)
-        unseen = pygame.display.get_driver() in ("offscreen", "dummy")
-        if unseen and not os.environ.get("SDL_VIDEODRIVER"):
-            raise pygame.error("none")
-        pygame.display.set_caption(title)
-        yield pygame
+        window = pygame.display.set_mode(SIZE)
     except pygame.error as error:
-        hint = "SDL_VIDEODRIVER=dummy draws unseen"
-        raise ValueError(f"window: expected a display ({hint}), got {error}") from error
-    finally:
-        pygame.display.quit()
-
-
-def show(pygame: Any, machine: Machine, scene: Scene) -> None:
-    """Fill the window with a scene."""
-    pixels = draw(machine, scene, SIZE).tobytes()
-    pygame.display.get_surface().blit(pygame.image.frombytes(pixels, SIZE, "RGB"), (0, 0))
-    pygame.display.flip()
+        raise ValueError(f"window: expected a display, got {error}") from error
+    unseen = pygame.display.get_driver() in ("offscreen", "dummy")
+    require(not unseen or "SDL_VIDEODRIVER" in os.environ, "window", "a display", "none")
+    pygame.display.set_caption(f"brokk_min: {HELP}")
+    return window

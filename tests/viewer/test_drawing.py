@@ -73,7 +73,7 @@ def test_draw__is_an_image_of_the_wanted_size_that_shows_all_of_the_scene():
     assert (image.shape, image.dtype) == ((360, 640, 3), np.uint8)
     trail = tool(Q) + np.array([[0, 0, 0], [0.5, 0.5, 0.5]])
     others = {"q": Q + 0.1, "u": np.full(5, 0.3), "v_goal": -first.v_goal, "v_tool": first.v_goal}
-    others |= {"trail": trail, "title": "policy", "status": "3.0 s", "notes": ["TAB"]}
+    others |= {"trail": trail, "title": "policy", "status": "3.0 s"}
     for name, other in others.items():
         changed = np.array(drawing.draw(BROKK_170, first._replace(**{name: other}), (640, 360)))
         assert (image != changed).any(axis=-1).sum() > 20, name

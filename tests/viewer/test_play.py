@@ -71,41 +71,36 @@ def test_gamepad__drives_until_it_is_unplugged(operator):
     assert actions == ["other"]
     device.unplug()
     assert not look(operator)[1].any()
-    assert operator.pad is None
 
 
 def test_session__follows_the_goal_with_each_of_its_controllers():
     goal, session = np.array([0.0, 0.2, 0.0]), Session(BROKK_170, {"PID": BASELINE, "jog": JOG})
     for _ in range(60):
-        session.tick(goal)
-    assert session.state.v_tool[0] == pytest.approx(goal, abs=0.05)
-    first = tool_position(forward_kinematics(BROKK_170, START))
-    np.testing.assert_allclose(session.trail[0], first)
-    scene = session.scene()
-    np.testing.assert_array_equal(scene.q, session.state.q[0])
+        scene = session.tick(goal)
+    assert scene.v_tool == pytest.approx(goal, abs=0.05)
+    first, last = tool_position(forward_kinematics(BROKK_170, np.array([START, scene.q])))
+    np.testing.assert_allclose(scene.trail[[0, -1]], [first, last], atol=1e-3)
     assert (scene.title, scene.status, scene.colour) == ("PID", "3.0 s", drawing.BLUE)
     session.switch()
-    assert (session.scene().title, session.scene().colour) == ("jog", drawing.ORANGE)
-    session.tick(np.array([0.2, 0.0, 0.0]))
-    np.testing.assert_allclose(session.scene().u * 127, [12, 0, 0, 0, 0], atol=1e-5)
-    session.switch()
-    assert session.scene().title == "PID"
+    scene = session.tick(np.array([0.2, 0.0, 0.0]))
+    assert (scene.title, scene.colour) == ("jog", drawing.ORANGE)
+    np.testing.assert_allclose(scene.u * 127, [12, 0, 0, 0, 0], atol=1e-5)
 
 
 def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch, held):
     """In real time: arrow key, and through pygame's queue the other controller, and closing."""
-    scenes, show = [], play.show
+    scenes, draw = [], play.draw
 
-    def each_picture(pg, machine, shown):
-        show(pg, machine, shown)
-        scenes.append(shown)
+    def each_picture(machine, scene, size):
+        scenes.append(scene)
         held.add("left")
         for at, name in ((20, "tab"), (22, "escape")):
             if len(scenes) == at:
                 code = pygame.key.key_code(name)
                 pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=code))
+        return draw(machine, scene, size)
 
-    monkeypatch.setattr(play, "show", each_picture)
+    monkeypatch.setattr(play, "draw", each_picture)
     assert run("play") == 0
     titles = [TITLES["rl"]] * 20 + [TITLES["jacobian_pid_k0.1"]] * 2
     assert [scene.title for scene in scenes] == titles
@@ -117,5 +112,5 @@ def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch,
 def test_play__needs_a_display(monkeypatch):
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
-    with pytest.raises(ValueError, match=r"window: expected a display .*, got nonsense"):
+    with pytest.raises(ValueError, match=r"window: expected a display, got nonsense"):
         play.play(BROKK_170, {"PID": BASELINE})
