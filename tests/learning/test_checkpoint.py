@@ -60,12 +60,9 @@ def test_prepare__begins_what_the_recipe_says(paper, critic):
     recipe = find_recipe(paper, critic)
     env, advantages, start = prepare(BROKK_170, NET, recipe, seed=3)
     assert env.interface is (PAPER if paper else INTERFACE)
-    assert env.config.hold_max_s == (6.0 if paper else 3.0)
-    assert type(env) is (TaskVectorEnv if critic else GroupVectorEnv)
+    assert isinstance(env, GroupVectorEnv) != critic
     assert advantages is (critic_advantages if critic else group_advantages)
-    assert recipe.learner.gae_lambda == (0.95 if critic else 1.0)
-    kind = torch.optim.Adam if paper or critic else torch.optim.Muon
-    assert isinstance(start.optimizer, kind)
+    assert isinstance(start.optimizer, torch.optim.Muon) != (paper or critic)
     assert len(np.unique(env.state.ticks)) > 100 and env.state.ticks.max() > 0.95 * 400
     assert not env.state.ticks[env.state.lowest < 0].any()
     assert start.obs.shape == (256, len(env.interface.scale(BROKK_170)[0]))

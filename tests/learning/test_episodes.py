@@ -1,4 +1,4 @@
-"""Episodes: distributions of poses, goals and noise, rows that are replaced."""
+"""Episodes: distributions of poses, goals and noise."""
 
 import numpy as np
 import pytest
@@ -42,18 +42,6 @@ def test_draw_goal__has_the_configured_fractions_speeds_and_directions():
 def test_draw_hold__is_whole_ticks_and_at_least_one(seconds, ticks):
     config = TaskConfig(hold_min_s=seconds, hold_max_s=seconds)
     assert episodes.draw_hold(BROKK_170, config, default_rng(0), 3).tolist() == [ticks] * 3
-
-
-def test_replace_rows__replaces_whole_rows_and_nothing_else():
-    old = episodes.reset(BROKK_170, TaskConfig(), default_rng(1), 5)
-    new = episodes.reset(BROKK_170, TaskConfig(), default_rng(2), 2)
-    state = episodes.replace_rows(old, np.array([4, 1]), new)
-    arrays = ((*one.plant, *one[1:]) for one in (old, new, state))  # the plant's stand first
-    for before, fresh, after in zip(*arrays, strict=True):
-        assert np.array_equal(after[[0, 2, 3]], before[[0, 2, 3]])
-        assert np.array_equal(after[[4, 1]], fresh)
-    assert not np.array_equal(old.q, state.q)
-    assert episodes.replace_rows(None, np.array([1]), None) is None
 
 
 def test_draw_noise__is_uniform_up_to_the_largest():

@@ -5,18 +5,15 @@ from collections import Counter
 import numpy as np
 import pygame
 import pytest
-from helpers_bus import BASELINE, START, Virtual
+from helpers_bus import BASELINE, Virtual
 from helpers_cli import run
 from pygame._sdl2 import controller
 
-from brokk_min.can.operator_input import JointJog
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import drawing, play
-from brokk_min.viewer.play import Operator, Session
-
-JOG = JointJog(BROKK_170, "q1", 12)
+from brokk_min.viewer.play import Operator
 
 
 @pytest.fixture
@@ -73,20 +70,6 @@ def test_gamepad__drives_until_it_is_unplugged(operator):
     assert not look(operator)[1].any()
 
 
-def test_session__follows_the_goal_with_each_of_its_controllers():
-    goal, session = np.array([0.0, 0.2, 0.0]), Session(BROKK_170, {"PID": BASELINE, "jog": JOG})
-    for _ in range(60):
-        scene = session.tick(goal)
-    assert scene.v_tool == pytest.approx(goal, abs=0.05)
-    first, last = tool_position(forward_kinematics(BROKK_170, np.array([START, scene.q])))
-    np.testing.assert_allclose(scene.trail[[0, -1]], [first, last], atol=1e-3)
-    assert (scene.title, scene.status, scene.colour) == ("PID", "3.0 s", drawing.BLUE)
-    session.switch()
-    scene = session.tick(np.array([0.2, 0.0, 0.0]))
-    assert (scene.title, scene.colour) == ("jog", drawing.ORANGE)
-    np.testing.assert_allclose(scene.u * 127, [12, 0, 0, 0, 0], atol=1e-5)
-
-
 def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch, held):
     """In real time: arrow key, and through pygame's queue the other controller, and closing."""
     scenes, draw = [], play.draw
@@ -104,7 +87,11 @@ def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch,
     assert run("play") == 0
     titles = [TITLES["rl"]] * 20 + [TITLES["jacobian_pid_k0.1"]] * 2
     assert [scene.title for scene in scenes] == titles
-    assert scenes[19].v_tool[1] > 0.1
+    last = scenes[19]
+    assert last.v_tool[1] > 0.1 and last.u.any()
+    assert (last.status, last.colour, scenes[-1].colour) == ("1.0 s", drawing.BLUE, drawing.ORANGE)
+    fk = forward_kinematics(BROKK_170, np.array([scene.q for scene in scenes]))
+    np.testing.assert_allclose(scenes[-1].trail, tool_position(fk))
     np.testing.assert_allclose([scene.v_goal for scene in scenes[-2:]], 2 * [[0, 0.3, 0]])
     assert not pygame.display.get_init()
 
