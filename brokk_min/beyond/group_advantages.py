@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from brokk_min import ppo
-from brokk_min.learning.episodes import map_arrays, repeat
+from brokk_min.learning.episodes import map_arrays
 from brokk_min.learning.gym_env import Step, TaskVectorEnv
 from brokk_min.machine import Array, require
 from brokk_min.settings import PPOConfig
@@ -60,7 +60,7 @@ class GroupVectorEnv(TaskVectorEnv):
         self.ticks += 1
         if self.ticks % self.horizon == 0:
             groups = np.arange(0, self.num_envs, COPIES)
-            rows = repeat(groups + self.np_random.integers(0, COPIES, len(groups)), COPIES)
+            rows = (groups + self.np_random.integers(0, COPIES, len(groups))).repeat(COPIES)
             info = {"final_obs": obs} | info | {"_final_obs": np.ones_like(terminated)}
             truncated = ~terminated
             self.state, self.memory, obs = map_arrays(

@@ -113,7 +113,7 @@ def save(
         "arrays": arrays,
         "rows": rows,
     }
-    buffer = io.BytesIO()
+    buffer = io.BytesIO()  # torch would not say that a disk is full
     torch.save(content, buffer)
     with whole_file(path) as file:
         file.write(buffer.getvalue())

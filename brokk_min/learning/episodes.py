@@ -39,13 +39,18 @@ def draw_hold(
 
 
 def reset(
-    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: Plant = PLANT
+    machine: Machine,
+    config: TaskConfig,
+    rng: np.random.Generator,
+    num: int,
+    plant: Plant = PLANT,
+    copies: int = 1,
 ) -> State:
-    """`num` machines at rest in random poses with random goals; leading shape (num,)."""
-    pose = draw_pose(machine, rng, num)
-    goal = draw_goal(machine, config, rng, num)
-    state = initial_state(machine, pose, goal, plant)
-    return state._replace(goal_ticks=draw_hold(machine, config, rng, num))
+    """`num` machines at rest in random poses with random goals, `copies` neighbours in the same."""
+    pose = draw_pose(machine, rng, num // copies).repeat(copies, axis=0)
+    goal = draw_goal(machine, config, rng, num // copies).repeat(copies, axis=0)
+    hold = draw_hold(machine, config, rng, num // copies).repeat(copies)
+    return initial_state(machine, pose, goal, plant)._replace(goal_ticks=hold)
 
 
 def new_goals(
@@ -57,8 +62,8 @@ def new_goals(
         return state
     num = len(rows) // copies
     v_goal, goal_ticks = state.v_goal.copy(), state.goal_ticks.copy()
-    v_goal[rows] = repeat(draw_goal(machine, config, rng, num), copies)
-    goal_ticks[rows] = repeat(draw_hold(machine, config, rng, num), copies)
+    v_goal[rows] = draw_goal(machine, config, rng, num).repeat(copies, axis=0)
+    goal_ticks[rows] = draw_hold(machine, config, rng, num).repeat(copies)
     return state._replace(v_goal=v_goal, goal_ticks=goal_ticks)
 
 
@@ -77,11 +82,6 @@ def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
         values = [map_arrays(function, *row) for row in zip(first, *others, strict=True)]
         return first._make(values) if hasattr(first, "_make") else tuple(values)
     return function(first, *others)
-
-
-def repeat(values: Any, copies: int) -> Any:
-    """Each row of `values` so many times; values as for `map_arrays`."""
-    return map_arrays(lambda rows: np.repeat(rows, copies, axis=0), values)
 
 
 def replace_rows(values: Any, rows: NDArray[np.intp], fresh: Any) -> Any:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brokk_min import env
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import PAPER, Interface, State, measure
-from brokk_min.learning.episodes import draw_noise, new_goals, repeat, replace_rows, reset
+from brokk_min.learning.episodes import draw_noise, new_goals, replace_rows, reset
 from brokk_min.machine import BROKK_170, Array, Machine, require
 from brokk_min.settings import TaskConfig
 
@@ -86,9 +86,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     def begin_episodes(self, mask: Bools) -> None:
         """Draw new episodes where `mask` is true; others go on."""
         rows = np.flatnonzero(mask)
-        num = len(rows) // self.copies
-        state = reset(self.machine, self.config, self.np_random, num, self.plant)
-        state = repeat(state, self.copies)
+        m, rng = self.machine, self.np_random
+        state = reset(m, self.config, rng, len(rows), self.plant, self.copies)
         fresh = state, *self.observe(state, None)
         if len(rows) < self.num_envs:
             fresh = replace_rows((self.state, self.obs, self.memory), rows, fresh)
@@ -99,7 +98,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         """Observation with fresh noise (5 % in the paper), and the agent's memory with it."""
         m = self.machine
         noise = draw_noise(m, self.config.noise, len(state.q) // self.copies, self.np_random)
-        measured = measure(m, state.history, state.v_goal, repeat(noise, self.copies))
+        noise = noise.repeat(self.copies, axis=0)
+        measured = measure(m, state.history, state.v_goal, noise)
         memory = self.interface.remember(m, memory, measured)
         return self.interface.observe(m, measured, memory), memory
 

@@ -9,14 +9,12 @@ from brokk_min._files import require_package, whole_file
 from brokk_min.learning.policy import INTERFACES, Policy, contract
 from brokk_min.ppo import mlp
 
-TABLES = {"paper": "brokk_min/env.py", "beyond": "brokk_min/beyond/interface.py"}
-
 
 def export_onnx(path: Path, policy: Policy) -> None:
     """Write a policy as one ONNX file: `observation` (batch, obs) in, `action` (batch, driven) out.
 
-    The other program makes the observation and the command, as the policy's `env.Interface` does;
-    see examples/run_onnx.py. What it must agree with is in the metadata, as JSON by name.
+    The other program makes the observation and the command, as the policy's `env.Interface` does.
+    What it must agree with is in the metadata, as JSON by name; examples/run_onnx.py reads it.
     ValueError: the package onnxscript is not installed.
     """
     require_package("onnxscript", "export")
@@ -36,9 +34,6 @@ def export_onnx(path: Path, policy: Policy) -> None:
     mean, scale = INTERFACES[policy.interface].scale(policy.machine)
     told = contract(policy.machine) | {"interface": policy.interface}
     told |= {"mean": mean.tolist(), "scale": scale.tolist()}
-    told["observation"] = f"less mean, over scale; {TABLES[policy.interface]} has its table"
-    told["action"] = "of pwm_limit / 127 of each driven joint, cut at 1 and rounded to counts"
-    told["geometry_columns"] = ["a", "alpha", "d", "theta", "q_min", "q_max", "kind"]  # m and rad
     program.model.metadata_props.update({name: json.dumps(value) for name, value in told.items()})
     with whole_file(path) as file:
         file.write(program.model_proto.SerializeToString())

@@ -37,12 +37,8 @@ class Policy:
         """Mean actions (..., n_driven), not clipped, for standardised observations (..., obs).
 
         Paper: Sec. 3.4 (256-128-64, ELU)
-        ValueError: a wrong shape, or an observation that is not finite.
         """
         x: Array = np.asarray(observation, np.float32)
-        size = len(self.weights[0])
-        fits = x.shape[-1:] == (size,) and bool(np.isfinite(x).all())
-        require(fits, "observation", f"finite (..., {size})", x.shape)
         layers = list(zip(self.weights[::2], self.weights[1::2], strict=True))
         for w, b in layers[:-1]:
             x = x @ w + b
@@ -94,16 +90,14 @@ def save_policy(path: Path, policy: Policy) -> None:
 def load_policy(path: Path, machine: Machine) -> Policy:
     """Read a policy for `machine`.
 
-    ValueError: not a policy file, or one for another machine, joint order, history, rate or scale,
-    with what was expected and what was found.
+    ValueError: not a policy file, or one for another machine, with the first difference.
     """
     header, arrays = load_arrays(path, KIND)
     with expected(path, "a complete policy"):
         expect_same(path, header["contract"], contract(machine))
         mean, scale = INTERFACES[header["interface"]].scale(machine)
         fits = np.array_equal(arrays["mean"], mean) and np.array_equal(arrays["scale"], scale)
-        wanted = f"the scale of interface {header['interface']} for the machine"
-        require(fits, str(path), wanted, "another")
+        require(fits, str(path), f"the machine's scale of {header['interface']}", "another")
         weights = tuple(arrays[f"layer_{i}"] for i in range(8))
         net = select_nets(machine, net_from_arrays(path, header["net"], arrays))
         return Policy(machine, header["training"], weights, net, header["interface"])

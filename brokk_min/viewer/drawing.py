@@ -16,12 +16,10 @@ from PIL import Image, ImageDraw, ImageFont
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import PWM_MAX, Array, Machine
 
-Colour = tuple[int, int, int]
 Pen = ImageDraw.ImageDraw
 BACKGROUND, INK, MUTED = (250, 250, 247), (33, 37, 43), (120, 128, 138)
 GRID, SLOT, SOIL = (228, 230, 232), (212, 216, 221), (214, 203, 186)
-MEASURED = (0, 158, 115)
-BLUE, ORANGE = (0, 114, 178), (213, 94, 0)  # of the machine under the policy, under the PID
+BLUE, MEASURED = (0, 114, 178), (0, 158, 115)
 HEAD, ROW = 72, 40  # heights of the title and of a joint's row
 ABOVE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # right and up of the top view
 
@@ -36,7 +34,6 @@ class Scene(NamedTuple):
     trail: Array = np.zeros((0, 3))  # past tool positions [m], (T, 3)
     title: str = ""
     status: str = ""
-    colour: Colour = BLUE
 
 
 def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
@@ -50,8 +47,7 @@ def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
         _tool(pen, machine, view, scene)
         image.paste(part, view.corner)
     pen = ImageDraw.Draw(image)
-    pen.regular_polygon((36, HEAD / 2, 12), 24, fill=scene.colour)
-    pen.text((60, HEAD / 2), scene.title, INK, _font(30), "lm")
+    pen.text((28, HEAD / 2), scene.title, INK, _font(30), "lm")
     pen.text((image.width - 28, HEAD / 2), scene.status, MUTED, _font(26), "rm")
     for i in range(machine.n):
         _joint_row(pen, machine, scene, i, image.size)
@@ -122,7 +118,7 @@ def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     ends = view.project(forward_kinematics(machine, scene.q).p)
     sizes = 0.03 * extent(machine)[0] * view.scale * np.linspace(1.0, 0.5, machine.n)
     for i in range(machine.n):
-        pen.line(ends[i : i + 2].ravel().tolist(), scene.colour, round(2 * float(sizes[i])))
+        pen.line(ends[i : i + 2].ravel().tolist(), BLUE, round(2 * float(sizes[i])))
         radius = max(6.0, 0.6 * float(sizes[i]))
         pen.regular_polygon((*ends[i], 1.2 * radius), 24, fill=INK)
         pen.regular_polygon((*ends[i], 0.5 * radius), 24, fill=BACKGROUND)
@@ -131,7 +127,7 @@ def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
 def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     """The trail of the tool, and the arrows of its velocities."""
     tip = view.project(tool_position(forward_kinematics(machine, scene.q)))
-    pen.line(view.project(scene.trail).ravel().tolist(), scene.colour, 5)
+    pen.line(view.project(scene.trail).ravel().tolist(), BLUE, 5)
     pen.regular_polygon((*tip, 8), 24, fill=INK)
     scale = 0.2 * min(view.size) / machine.tool_speed
     arrows = ((52, "measured", scene.v_tool, MEASURED), (20, "goal", scene.v_goal, INK))
@@ -167,7 +163,7 @@ def _joint_row(pen: Pen, machine: Machine, scene: Scene, i: int, size: tuple[int
         return
     middle, deflection = valve + length / 2, counts / machine.pwm_limit * length / 2
     pen.line((valve, y, valve + length, y), SLOT, 24)
-    pen.line((middle, y, middle + deflection, y), scene.colour, 24)
+    pen.line((middle, y, middle + deflection, y), BLUE, 24)
     pen.line((middle, y - 16, middle, y + 16), INK, 4)
     text = f"{round(counts):+d} of {machine.pwm_limit}"
     pen.text((valve + length + 16, y), text, INK, font, "lm")

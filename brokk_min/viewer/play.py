@@ -7,7 +7,6 @@ depends on timing.
 
 import os
 from collections import deque
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -21,7 +20,7 @@ from brokk_min.env import initial_state, measure, transition
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Machine, require
-from brokk_min.viewer.drawing import BLUE, ORANGE, Scene, draw
+from brokk_min.viewer.drawing import Scene, draw
 
 SIZE = (1120, 680)  # px, of the window
 TRAIL = 600  # positions of the tool that are shown
@@ -64,20 +63,15 @@ class Operator:
         return np.asarray(self.machine.tool_speed * target / length)
 
 
-@dataclass
 class Session:
     """A simulated machine, and the controller that drives it now."""
 
-    machine: Machine
-    controllers: dict[str, Controller]
-    plant: Plant = PLANT
-
-    def __post_init__(self) -> None:
-        q = start_pose(self.machine)[None]
-        self.state = initial_state(self.machine, q, np.zeros(3), self.plant)
+    def __init__(self, machine: Machine, controllers: dict[str, Controller], plant: Plant) -> None:
+        self.machine, self.controllers, self.plant = machine, controllers, plant
+        self.state = initial_state(machine, start_pose(machine)[None], np.zeros(3), plant)
         self.trail: deque[Array] = deque(maxlen=TRAIL)  # of the tool [m]
-        self.names = deque(self.controllers)  # the first one drives
-        self.memory = self.controllers[self.names[0]].start(1)
+        self.names = deque(controllers)  # the first one drives
+        self.memory = controllers[self.names[0]].start(1)
 
     def switch(self) -> None:
         """The next controller goes on from here."""
@@ -91,10 +85,9 @@ class Session:
         u, self.memory = self.controllers[self.names[0]](measured, self.memory)
         self.state = s = transition(self.machine, self.plant, self.state, u)
         self.trail.append(tool_position(forward_kinematics(self.machine, s.q[0])))
-        status = f"{s.ticks[0] * self.machine.dt:.1f} s"
-        colour = BLUE if self.names[0] == next(iter(self.controllers)) else ORANGE
         tool = s.v_goal[0], s.v_tool[0], np.array(self.trail)
-        return Scene(s.q[0], u[0], *tool, self.names[0], status, colour)
+        status = f"{s.ticks[0] * self.machine.dt:.1f} s"
+        return Scene(s.q[0], u[0], *tool, self.names[0], status)
 
 
 def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PLANT) -> None:

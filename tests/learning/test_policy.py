@@ -31,12 +31,6 @@ def test_act__equals_the_actor_of_torch():
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_act__refuses_wrong_shapes_and_what_is_not_finite():
-    for bad in (np.zeros(90), np.append(np.zeros(90), np.nan)):
-        with pytest.raises(ValueError, match=r"observation: expected finite \(\.\.\., 91\), got"):
-            random_policy("beyond").act(bad)
-
-
 @pytest.mark.parametrize("kind", ["paper", "beyond"])
 def test_controller__remembers_how_long_its_goal_is_zero(kind):
     """Valves of our agent close after 0.1 s of a zero goal; the paper's go on."""
@@ -57,7 +51,7 @@ def test_controller__remembers_how_long_its_goal_is_zero(kind):
         ({"rate": 40.0}, "rate: expected 40.0, got 20.0"),
         ({"name": "other"}, "machine: expected 'other', got 'brokk170'"),
         ({"joints": BROKK_170.joints[::-1]}, "joints: expected"),
-        ({"tool_speed": 0.2}, "expected the scale of interface paper for the machine, got another"),
+        ({"tool_speed": 0.2}, "expected the machine's scale of paper, got another"),
     ],
 )
 def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message):
