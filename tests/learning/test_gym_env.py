@@ -144,21 +144,11 @@ def test_wrappers__of_gymnasium_accept_the_vector(wrapper):
     assert 0 <= info["velocity_error"] < 1
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"machine": "brokk170"}, "machine: expected a Machine, got brokk170"),
-        ({"config": {"episode_s": 5.0}}, "config: expected a TaskConfig, got {'episode_s': 5.0}"),
-        ({"plant": "net.npz"}, "plant: expected reset and step, got net.npz"),
-        ({"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
-    ],
-)
-def test_make_vec__refuses_wrong_arguments_by_name(options, message):
-    with pytest.raises(ValueError, match=f"^{message}"):
-        gymnasium.make_vec(ID, **({"num_envs": 2} | options))
-
-
-def test_step__refuses_to_begin_without_a_reset():
+def test_environments__refuse_wrong_arguments_and_a_step_before_the_reset():
+    wrong = {"machine": "brokk170", "config": {"episode_s": 5.0}, "plant": "net.npz", "num_envs": 0}
+    for name, value in wrong.items():
+        with pytest.raises(ValueError, match=f"^{name}: expected .*, got {value}"):
+            gymnasium.make_vec(ID, **({"num_envs": 2} | {name: value}))
     with pytest.raises(ValueError, match="step: expected a reset before the first step, got none"):
         TaskVectorEnv(2).step(np.zeros((2, 4), np.float32))
 
