@@ -6,17 +6,23 @@ folder that the calls write to, and one thread each, because torch's settings ho
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import dask
 from dask.system import cpu_count
 from tqdm import tqdm
 
 from brokk_min.machine import require
 
-HOST = "127.0.0.1"  # of a scheduler of our own: no other computer can reach it
-TIMEOUT = 10  # s, in which the scheduler of a cluster must answer
+ENVIRON = "distributed.nanny.pre-spawn-environ"  # of the processes that run the calls
+SETTINGS = {
+    f"{ENVIRON}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
+    f"{ENVIRON}.MALLOC_MMAP_THRESHOLD_": 2**30,  # glibc adapts it no more then
+    "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
+}
+LOCAL = {"threads_per_worker": 1, "memory_limit": None, "silence_logs": "CRITICAL"}
+LOCAL |= {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}  # no other computer reaches it
 
 
 def side_by_side(
@@ -27,11 +33,19 @@ def side_by_side(
     """Results of calls by their names, each from a process of one thread.
 
     A call receives the results of those that it `needs`, which stand before it. The others begin
-    in their order, so the longest should stand first. The first exception is raised.
+    in their order, so the longest should stand first. The first exception is raised. OSError: no
+    scheduler answers at that address. ValueError: it has workers of several threads.
     """
-    from distributed import as_completed  # slow to import
+    from distributed import Client, as_completed  # slow to import
 
-    with connect(scheduler, min(cpu_count(), len(calls))) as client:
+    local = LOCAL | {"n_workers": min(cpu_count(), len(calls))}
+    options: dict[str, Any] = {"address": scheduler, "timeout": 10} if scheduler else local
+    with dask.config.set(SETTINGS), Client(**options) as client:  # type: ignore[no-untyped-call]
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        threads = sorted({worker["nthreads"] for worker in workers} - {1})
+        require(not threads, str(scheduler), "workers with --nthreads 1", threads)
+        if scheduler is None:
+            client.run(_hide_bars)
         jobs: dict[str, Any] = {}
         for name, call in calls.items():
             results = [jobs[other] for other in (needs or {}).get(name, ())]
@@ -40,34 +54,6 @@ def side_by_side(
         bar = tqdm(ended, total=len(jobs), unit="job", disable=None)
         done = {job.key: result for job, result in bar}
         return {name: done[job.key] for name, job in jobs.items()}
-
-
-@contextmanager
-def connect(scheduler: str | None, workers: int) -> Iterator[Any]:
-    """A dask client of the scheduler at an address, or (None) of processes on this machine.
-
-    OSError: no scheduler answers there. ValueError: it has workers of several threads.
-    """
-    import dask
-    from distributed import Client  # slow to import
-
-    options: dict[str, Any] = {"address": scheduler, "timeout": TIMEOUT}
-    if scheduler is None:
-        options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": None}
-        options |= {"host": HOST, "dashboard_address": f"{HOST}:0", "silence_logs": "CRITICAL"}
-    environ = "distributed.nanny.pre-spawn-environ"  # of the processes that run the calls
-    settings = {
-        f"{environ}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
-        f"{environ}.MALLOC_MMAP_THRESHOLD_": 2**30,  # glibc adapts it no more then
-        "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
-    }
-    with dask.config.set(settings), Client(**options) as client:  # type: ignore[no-untyped-call]
-        of_workers = client.scheduler_info(n_workers=-1)["workers"].values()
-        threads = sorted({worker["nthreads"] for worker in of_workers} - {1})
-        require(not threads, str(scheduler), "workers with --nthreads 1", threads)
-        if scheduler is None:
-            client.run(_hide_bars)
-        yield client
 
 
 def _hide_bars() -> None:

@@ -7,7 +7,7 @@ from functools import partial
 import psutil
 import pytest
 
-from brokk_min.learning.jobs import connect, side_by_side
+from brokk_min.learning.jobs import side_by_side
 
 distributed = pytest.importorskip("distributed")
 
@@ -30,16 +30,16 @@ def test_side_by_side__raises_what_a_call_raises():
         side_by_side({"a": os.getpid, "b": partial(int, "x")})
 
 
-def test_connect__no_other_computer_can_reach_the_workers():
-    with connect(None, 1) as client:
-        me = psutil.Process()
-        family = [me, *me.children(recursive=True)]
-        ports = [one for who in family for one in who.net_connections("inet")]
-        listening = {one.laddr.ip for one in ports if one.status == psutil.CONN_LISTEN}
-        assert listening == {"127.0.0.1"}
-        assert client.submit(os.getpid).result() != os.getpid()
-        threads = client.submit(os.getenv, "OMP_NUM_THREADS").result()
-        assert threads == "1"
+def ports(pid):
+    """Addresses at which a process and those that it started listen."""
+    family = [psutil.Process(pid), *psutil.Process(pid).children(recursive=True)]
+    found = [one for who in family for one in who.net_connections("inet")]
+    return {one.laddr.ip for one in found if one.status == psutil.CONN_LISTEN}
+
+
+def test_side_by_side__calls_have_one_thread_and_no_other_computer_can_reach_them():
+    calls = {"ports": partial(ports, os.getpid()), "n": partial(os.getenv, "OMP_NUM_THREADS")}
+    assert side_by_side(calls) == {"ports": {"127.0.0.1"}, "n": "1"}
 
 
 @pytest.mark.parametrize("threads", [1, 2])
