@@ -37,8 +37,7 @@ def scenes(machine: Machine, path: Path) -> list[Scene]:
     fk = forward_kinematics(machine, q)
     q_dot = velocity_of(q, machine.velocity_samples, machine.rate)
     p, v = tool_position(fk), tool_velocity(fk, q_dot)
-    run = []
-    for k, t in enumerate(ticks):
-        status = f"{k * machine.dt:.1f} s"
-        run.append(Scene(t.q, t.u, t.v_goal, v[k], p[: k + 1], path.name, status))
-    return run
+    return [
+        Scene(t.q, t.u, t.v_goal, v[k], p[: k + 1], path.name, f"{k * machine.dt:.1f} s")
+        for k, t in enumerate(ticks)
+    ]
