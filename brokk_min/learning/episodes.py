@@ -39,17 +39,12 @@ def draw_hold(
 
 
 def reset(
-    machine: Machine,
-    config: TaskConfig,
-    rng: np.random.Generator,
-    num: int,
-    plant: Plant = PLANT,
-    copies: int = 1,
+    machine: Machine, config: TaskConfig, rng: np.random.Generator, num: int, plant: Plant = PLANT
 ) -> State:
-    """`num` machines at rest in random poses with random goals, `copies` neighbours in the same."""
-    pose = draw_pose(machine, rng, num // copies).repeat(copies, axis=0)
-    goal = draw_goal(machine, config, rng, num // copies).repeat(copies, axis=0)
-    hold = draw_hold(machine, config, rng, num // copies).repeat(copies)
+    """`num` machines at rest in random poses with random goals; leading shape (num,)."""
+    pose = draw_pose(machine, rng, num)
+    goal = draw_goal(machine, config, rng, num)
+    hold = draw_hold(machine, config, rng, num)
     return initial_state(machine, pose, goal, plant)._replace(goal_ticks=hold)
 
 

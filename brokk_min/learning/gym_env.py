@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brokk_min import env
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import PAPER, Interface, State, measure
-from brokk_min.learning.episodes import draw_noise, new_goals, replace_rows, reset
+from brokk_min.learning.episodes import draw_noise, map_arrays, new_goals, replace_rows, reset
 from brokk_min.machine import BROKK_170, Array, Machine, require
 from brokk_min.settings import TaskConfig
 
@@ -86,8 +86,9 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     def begin_episodes(self, mask: Bools) -> None:
         """Draw new episodes where `mask` is true; others go on."""
         rows = np.flatnonzero(mask)
-        m, rng = self.machine, self.np_random
-        state = reset(m, self.config, rng, len(rows), self.plant, self.copies)
+        num = len(rows) // self.copies
+        state = reset(self.machine, self.config, self.np_random, num, self.plant)
+        state = map_arrays(lambda array: array.repeat(self.copies, axis=0), state)
         fresh = state, *self.observe(state, None)
         if len(rows) < self.num_envs:
             fresh = replace_rows((self.state, self.obs, self.memory), rows, fresh)
