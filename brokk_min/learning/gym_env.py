@@ -6,6 +6,7 @@ Importing this module registers them, and Gymnasium can import it by the name of
     gymnasium.make_vec("brokk_min.learning.gym_env:brokk_min/Brokk170-v0", num_envs=256)
 """
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -35,8 +36,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     observation of an episode where `info["_final_obs"]` is set.
 
     Gymnasium's `AutoresetMode` explains when an ended episode resets; its vector wrappers of
-    observations accept NEXT_STEP. The mode "rgb_array" renders the first machine. ValueError: an
-    argument that is wrong.
+    observations accept NEXT_STEP. `max_episode_steps` counts ticks and stands for the seconds of
+    `config`. The mode "rgb_array" renders the first machine. ValueError: an argument that is wrong.
     """
 
     copies = 1  # neighbours that share starts, goals, noise and ends: `beyond.group_advantages`
@@ -53,11 +54,14 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         interface: Interface = PAPER,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
     ) -> None:
         require(num_envs > 0, "num_envs", "1 or more", num_envs)
         require(isinstance(machine, Machine), "machine", "a Machine", machine)
         require(isinstance(config, TaskConfig), "config", "a TaskConfig", config)
         require(hasattr(plant, "step"), "plant", "reset and step", plant)
+        if max_episode_steps is not None:
+            config = replace(config, episode_s=max_episode_steps / machine.rate)
         rate, mode = round(machine.rate), AutoresetMode(autoreset_mode)
         self.metadata = TaskEnv.metadata | {"render_fps": rate, "autoreset_mode": mode}
         self.num_envs, self.plant, self.machine, self.config = num_envs, plant, machine, config
