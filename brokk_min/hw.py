@@ -18,7 +18,7 @@ from brokk_min.actuator import append_sample, initial_history
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Array, Operator, OperatorInput
 from brokk_min.can.connection import Bus, stop_signals
-from brokk_min.can.safety_gate import GateInputs, fault_name, gate, gate_start
+from brokk_min.can.safety_gate import GateInputs, gate, gate_start
 from brokk_min.env import measure
 from brokk_min.machine import PWM_MAX, Machine, Measured
 
@@ -63,7 +63,7 @@ class Drive:
                         show(self)
         except BaseException:
             self.exception = "the loop ended"
-            self.send_command(np.zeros(self.machine.n), self.nodes.counts())
+            self.send_command(np.zeros(self.machine.n), self.gate.counts)
             raise
         finally:
             gc.enable()
@@ -72,15 +72,14 @@ class Drive:
         """Wait for the deadline, then one tick; False if it was the last."""
         self.wait()
         with self.catch_errors():
-            ready = bool(self.gate.active_fault == 0)
-            entered = self.operator(bool(self.gate.driving), ready)
-            self.operator_input = canopen.unpack_operator_input(entered.pack())  # as it is logged
+            ready = not str(self.gate.active_fault)
+            self.operator_input = self.operator(bool(self.gate.driving), ready)
         self.nodes.frames *= 2  # 1 is sound: a position that came before SYNC becomes 2, a fault
         with self.catch_errors():
             self.bus.send(canopen.SYNC, b"")
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
             self.nodes.listen(self.bus, answer_by, until_complete=True)
-        counts = self.nodes.counts()  # by the encoders' zeros and signs
+        counts = canopen.encoder_counts(self.machine, self.nodes.raw)
         command = np.zeros(self.machine.n)
         with self.catch_errors():
             command = self.control(counts)
@@ -145,10 +144,9 @@ class Drive:
     @property
     def reason(self) -> str:
         """Why it does not drive: the fault that stopped it, or what is in the way."""
-        stopped = fault_name(self.machine, int(self.gate.latched_fault))
-        now = fault_name(self.machine, int(self.gate.active_fault))
+        stopped = str(self.gate.latched_fault)
         error = f" ({self.last_exception})" if self.last_exception else ""
-        return (f"fault: {stopped}" if stopped else now) + error
+        return (f"fault: {stopped}" if stopped else str(self.gate.active_fault)) + error
 
     def wait(self) -> None:
         """Listen until the deadline, then set the next one, which is in the future."""

@@ -147,7 +147,7 @@ def command(joint, value):
 SEND_ERROR = raises(can.CanOperationError("no buffer space"))
 OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
 NOT_OPERATIONAL = "valve controller: not operational"
-DOUBLED = "doubled or malformed"
+DOUBLED = "position doubled, not of 4 bytes"
 FAULTS = {
     "valve controller silent": (up(0x710, lambda d: []), "valve controller: heartbeat lost"),
     "valve controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),

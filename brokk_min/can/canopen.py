@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import PWM_MAX, Joint, Machine, decode_pwm, encode_pwm, require
+from brokk_min.machine import PWM_MAX, Machine, decode_pwm, encode_pwm, require
 
 Array = NDArray[Any]  # counts and flags, too
 
@@ -19,14 +19,8 @@ TPDO1 = 0x180
 SDO_ANSWER = 0x580
 SDO_REQUEST = 0x600
 HEARTBEAT = 0x700
-# objects of an encoder: index, subindex
-HEARTBEAT_OBJECT = (0x1017, 0)  # period [ms]
-TPDO1_OBJECT = (0x1800, 1)  # identifier; bit 31: switched off,
+TPDO1_OBJECT = (0x1800, 1)  # index, subindex of its identifier; bit 31: switched off,
 REMOTE_REFUSED = 1 << 30  # and this bit: no remote requests, which we do not send
-SYNC_OBJECT = (0x1800, 2)  # after how many SYNCs a position is sent
-MAPPING_OBJECT = 0x1A00  # of TPDO1: subindex 0 has the number of entries, which follow
-POSITION_ENTRY = 0x6004_00_20  # in the mapping: index, subindex, number of bits
-RESOLUTION_OBJECT = (0x6501, 0)  # counts per turn
 OPERATIONAL = 5  # NMT state
 START_ALL = bytes([1, 0])  # NMT command
 PRE_OPERATIONAL_ALL = bytes([128, 0])  # in this state every encoder takes settings
@@ -64,7 +58,6 @@ class Nodes:
         self.frames = np.zeros(machine.n, int)  # positions of this tick; a malformed one counts 2
         self.heartbeat = np.full(machine.n + 1, -np.inf)  # s, -inf: never
         self.nmt = np.zeros(machine.n + 1, int)
-        self.size = np.zeros(machine.n, int)  # bytes of the newest positions
         self.u: Array = np.zeros(machine.n)  # commands of the newest valve frame
         self.enable = False  # of it
         self.valve_time = -np.inf  # s, of it
@@ -89,7 +82,6 @@ class Nodes:
         if frame.id in self.position_index:
             i = self.position_index[frame.id]
             raw = int.from_bytes(frame.data, "little")
-            self.size[i] = len(frame.data)
             if len(frame.data) == 4 and raw != NO_POSITION:
                 self.frames[i] += 1
                 self.raw[i] = raw
@@ -103,17 +95,9 @@ class Nodes:
             self.u, self.enable = read_valve_frame(self.machine, frame.data)
             self.valve_time = frame.time
 
-    def counts(self) -> Array:
-        """Newest joint angles [counts], (n,)."""
-        return encoder_counts(self.machine, self.raw)
-
 
 def check_bus(machine: Machine) -> None:
-    """ValueError: a machine that does not fit the bus.
-
-    The valve frame has five joints and an identifier of its own; ticks must be shorter than the
-    watchdog; positions count from the middle of the range, so a range is less than a turn.
-    """
+    """ValueError: too many joints, an identifier twice, slow ticks, or joints beyond a turn."""
     require(machine.n <= MOST_JOINTS, "joints", f"at most {MOST_JOINTS} on a bus", machine.n)
     nodes, valves = node_numbers(machine), machine.valve_frame_id
     bases = (EMERGENCY, TPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
@@ -141,50 +125,28 @@ def set_up_nodes(bus: Any, machine: Machine) -> None:
     """
     check_bus(machine)
     for joint in machine.joints:
-        check_encoder(bus, machine, joint)
+        for (index, sub), (value, meaning) in encoder_objects(machine, joint.encoder_node).items():
+            found = sdo(bus, joint.encoder_node, (index, sub))
+            if (index, sub) == TPDO1_OBJECT:
+                found &= ~REMOTE_REFUSED
+            what = f"{joint.name}: object 0x{index:04X}:{sub:02X}"
+            require(found == value, what, meaning, f"{found} (0x{found:X})")
     bus.send(NMT, PRE_OPERATIONAL_ALL)
     for joint in machine.joints:
-        sdo(bus, joint.encoder_node, HEARTBEAT_OBJECT, round(1e3 * HEARTBEAT_PERIOD), size=2)
-        sdo(bus, joint.encoder_node, SYNC_OBJECT, 1, size=1)
+        sdo(bus, joint.encoder_node, (0x1017, 0), round(1e3 * HEARTBEAT_PERIOD), size=2)  # ms
+        sdo(bus, joint.encoder_node, (0x1800, 2), 1, size=1)  # a position after every SYNC
     bus.send(NMT, START_ALL)
-    check_positions(bus, machine)
-
-
-def check_positions(bus: Any, machine: Machine) -> None:
-    """ValueError: an encoder that does not answer SYNC with the four bytes of a position."""
-    nodes = Nodes(machine)
-    for _ in range(round(SDO_TIMEOUT / machine.dt)):  # a node may take some time to start
-        nodes.start_tick()
-        bus.send(SYNC, b"")
-        nodes.listen(bus, bus.now() + machine.dt, until_complete=True)
-        if (nodes.frames > 0).all():
-            break
-    for joint, came, size in zip(machine.joints, nodes.frames, nodes.size):
-        wanted = f"TPDO1 of node {joint.encoder_node} with 4 bytes after SYNC"
-        got = f"one that has {size} bytes" if came else "none"
-        require(came and size == 4, joint.name, wanted, got)
 
 
 def encoder_objects(machine: Machine, node: int) -> dict[tuple[int, int], tuple[int, str]]:
-    """Objects of an encoder that are read: by address the value that fits, and what it means."""
+    """Objects of an encoder by index and subindex: the value that fits, and what it means."""
     turn = 2**machine.encoder_bits
     return {
-        RESOLUTION_OBJECT: (turn, f"{turn} counts a turn"),
+        (0x6501, 0): (turn, f"{turn} counts a turn"),
         TPDO1_OBJECT: (TPDO1 + node, f"TPDO1 with identifier 0x{TPDO1 + node:X}, switched on"),
-        (MAPPING_OBJECT, 0): (1, "one object in TPDO1"),
-        (MAPPING_OBJECT, 1): (POSITION_ENTRY, "the 4 bytes of object 0x6004 in TPDO1"),
+        (0x1A00, 0): (1, "one object in TPDO1"),
+        (0x1A00, 1): (0x6004_00_20, "the 4 bytes of object 0x6004 in TPDO1"),
     }
-
-
-def check_encoder(bus: Any, machine: Machine, joint: Joint) -> None:
-    """ValueError: an encoder with another resolution, or whose TPDO1 is not its position alone."""
-    node = joint.encoder_node
-    for address, (value, meaning) in encoder_objects(machine, node).items():
-        found = sdo(bus, node, address)
-        if address == TPDO1_OBJECT:
-            found &= ~REMOTE_REFUSED
-        where = "0x{:04X}:{:02X} of node {}".format(*address, node)
-        require(found == value, joint.name, f"{meaning} ({where})", f"{found} (0x{found:X})")
 
 
 def sdo(
@@ -197,16 +159,15 @@ def sdo(
     command = 0x40 if value is None else 0x23 | (4 - size) << 2
     request = struct.pack("<BHBI", command, *address, value or 0)
     bus.send(SDO_REQUEST + node, request)
-    got, end = "none", bus.now() + SDO_TIMEOUT
-    while got == "none" and bus.now() < end and (frame := bus.recv(max(0.0, end - bus.now()))):
+    what = "node {}: object 0x{:04X}:{:02X}".format(node, *address)
+    end = bus.now() + SDO_TIMEOUT
+    while (left := end - bus.now()) > 0 and (frame := bus.recv(left)):
         own = frame.id == SDO_ANSWER + node and frame.data[1:4] == request[1:4]
         if own and len(frame.data) == 8:
             command, answer = struct.unpack("<B3xI", frame.data)
-            if command != 0x80:
-                return int(answer)
-            got = f"SDO abort 0x{answer:08X}"
-    what = "node {}: object 0x{:04X}:{:02X}".format(node, *address)
-    raise ValueError(f"{what}: expected an answer within {SDO_TIMEOUT} s, got {got}")
+            require(command != 0x80, what, "an answer", f"SDO abort 0x{answer:08X}")
+            return int(answer)
+    raise ValueError(f"{what}: expected an answer within {SDO_TIMEOUT} s, got none")
 
 
 def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
@@ -269,9 +230,3 @@ class OperatorInput(NamedTuple):
 
 
 Operator = Callable[[bool, bool], OperatorInput]  # does the gate drive, is it ready -> the input
-
-
-def unpack_operator_input(data: bytes) -> OperatorInput:
-    """The inverse of `OperatorInput.pack`."""
-    x, y, z, flags = struct.unpack("<hhhB", data)
-    return OperatorInput((x / 1e4, y / 1e4, z / 1e4), *(bool(flags & 1 << i) for i in range(3)))

@@ -1,12 +1,11 @@
 """The CAN bus through python-can, and its log; python-can is imported when a bus is opened."""
 
 import os
-import select
 import signal
 import time
 from collections import deque
 from collections.abc import Callable, Container, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ class Bus:
     name: str = "can"  # of the bus in the log
     log: Any = None  # path of a log in candump's format, or a file
     echo: bool = False  # does the bus give back what we send?
-    file: int = -1  # descriptor to wait on; -1: `bus` waits itself
     clock: Callable[[], float] = time.monotonic  # s
     sleep: Callable[[float], object] = time.sleep
     allowed: Container[int] = range(0x800)  # identifiers of frames that it sends
@@ -42,11 +40,9 @@ class Bus:
     def recv(self, timeout: float) -> Frame | None:
         """The next frame within `timeout` [s], or None."""
         end = self.clock() + timeout
-        message = self.bus.recv(timeout if self.file < 0 else 0.0)
-        # python-can's own timeout follows the time of day, so we wait for the descriptor
-        while message is None and self.file >= 0 and (left := end - self.clock()) > 0:
-            if select.select([self.file], [], [], left)[0]:
-                message = self.bus.recv(0.0)
+        message = self.bus.recv(timeout)
+        while message is None and (left := end - self.clock()) > 0:
+            message = self.bus.recv(left)  # its timeout follows the time of day, which may be set
         if message is None:
             return None
         now, data = self.now(), bytes(message.data)
@@ -106,11 +102,8 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         raw = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
         raise ValueError(f"{where}, got {brief(error)}") from error
-    bus = Bus(raw, channel, log, echo=interface == "udp_multicast")
-    with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
-        bus.file = raw.fileno()
     try:
-        with closing(bus):
+        with closing(Bus(raw, channel, log, echo=interface == "udp_multicast")) as bus:
             yield bus
     except can.CanError as error:
         raise ValueError(f"{where} that works, got {brief(error)}") from error
@@ -121,10 +114,10 @@ def stop_signals() -> Iterator[list[int]]:
     """A list to which SIGINT, SIGTERM and SIGHUP are appended, instead of ending the program."""
     received: list[int] = []
     names = ("SIGINT", "SIGTERM", "SIGHUP")  # the last: a terminal was closed; not on Windows
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    numbers = [number for number in signal.Signals if number.name in names]
     handlers = [signal.signal(n, lambda number, _: received.append(number)) for n in numbers]
     try:
         yield received
     finally:
-        for number, handler in zip(numbers, handlers, strict=True):
+        for number, handler in zip(numbers, handlers):
             signal.signal(number, handler)

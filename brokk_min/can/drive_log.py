@@ -4,6 +4,7 @@ Logs are those of candump, and those of other tools that python-can reads (ASC, 
 """
 
 import re
+import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +13,7 @@ import numpy as np
 
 from brokk_min._files import brief, expected, require_package
 from brokk_min.can import canopen
-from brokk_min.can.canopen import Frame, Nodes, OperatorInput
+from brokk_min.can.canopen import Frame, Nodes
 from brokk_min.identification.logs import Log, machine_log
 from brokk_min.identification.readings import FASTER, NOISE
 from brokk_min.machine import Array, Machine, require
@@ -66,16 +67,16 @@ class Telemetry(NamedTuple):
 
 def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Telemetry]:
     """Telemetry of the ticks of a log; each ends with the SYNC of the next."""
-    nodes, operator = Nodes(machine), OperatorInput()
+    nodes, v_goal = Nodes(machine), np.zeros(3)
     start = 0.0  # s, time of the last SYNC
     for frame in frames:
         nodes.update(frame)
         if frame.id == canopen.OPERATOR_INPUT and frame.sent:
-            operator = canopen.unpack_operator_input(frame.data)
+            v_goal = np.array(struct.unpack_from("<hhh", frame.data)) / 1e4
         elif frame.id == canopen.SYNC:
-            q = np.where((nodes.frames == 1).all(), nodes.counts() * machine.encoder_step, np.nan)
-            v_goal = np.array(operator.v_goal) * nodes.enable
-            yield Telemetry(start, q, nodes.u, v_goal, nodes.enable)
+            counts = canopen.encoder_counts(machine, nodes.raw)
+            q = np.where((nodes.frames == 1).all(), counts * machine.encoder_step, np.nan)
+            yield Telemetry(start, q, nodes.u, v_goal * nodes.enable, nodes.enable)
             nodes.start_tick()
             nodes.enable = False  # until the next valve frame
             start = frame.time

@@ -4,7 +4,6 @@ A pure function of state, inputs and time, for one machine or many at once. It i
 function: a real machine keeps its hard-wired emergency stop (docs/hardware.md).
 """
 
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -28,43 +27,13 @@ IDLE_ZONES = 1.5  # largest dead zones, beyond which a valve is sure to open
 SLOWEST = 0.4  # of the fastest motion: long lever arm, weak pump
 
 
-class Fault(IntEnum):
-    """What can be wrong; of several at once the first is reported."""
-
-    text: str
-
-    def __new__(cls, value: int, text: str) -> "Fault":
-        """A number with its text."""
-        fault = int.__new__(cls, value)
-        fault._value_ = value
-        fault.text = text
-        return fault
-
-    NONE = 0, ""
-    ERROR = 1, "error"
-    FLOODED = 2, "bus flooded"
-    OTHER_SENDER = 3, "SYNC, NMT or valve frame of another sender"
-    LATE = 4, "tick late, or the clock was set"
-    OPERATOR_LOST = 5, "operator's device lost"
-    NEVER_SEEN = 6, "never seen"
-    HEARTBEAT_LOST = 7, "heartbeat lost"
-    NOT_OPERATIONAL = 8, "not operational"
-    SILENT = 9, "silent"
-    MALFORMED = 10, "doubled or malformed position"
-    OUT_OF_RANGE = 11, "out of range"
-    JUMPED = 12, "jumped"
-    FROZEN = 13, "frozen, or the joint does not move"
-    NO_COMMAND = 14, "no valid command"
-    STOP = 15, "stop asked for"
-
-
 class GateState(NamedTuple):
     """What the gate remembers: one or many gates, arrays (...) unless noted."""
 
     driving: Array  # may the valves move?
     armed_once: Array  # before, nothing is sent
-    active_fault: Array  # of this tick, see `fault_name`; 0: ready
-    latched_fault: Array  # what stopped it, until it is armed again; 0: nothing
+    active_fault: Array  # words of this tick's, see `fault_table`; empty: ready
+    latched_fault: Array  # words of what stopped it, until it is armed again; empty: nothing
     enable: Array  # dead-man switch at the last tick with device and without error
     time: Array  # s, of the last tick
     counter: Array  # of the last valve frame
@@ -98,8 +67,8 @@ def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
     return GateState(
         driving=no,
         armed_once=no,
-        active_fault=np.full(shape, (machine.n + 1) * Fault.ERROR),
-        latched_fault=zero,
+        active_fault=np.full(shape, "switched on"),
+        latched_fault=np.full(shape, ""),
         enable=~no,
         time=np.full(shape, -np.inf),
         counter=zero,
@@ -121,10 +90,10 @@ def gate(
     """
     now = np.asarray(now)
     place, motion = expected_motion(machine, state, inputs.counts)
-    fault = active_fault(machine, state, inputs, motion, now)
+    fault = first_fault(machine, fault_table(machine, state, inputs, motion, now))
     edge = inputs.enable & ~state.enable & inputs.centred
-    driving = inputs.enable & (state.driving | edge) & (fault == 0)
-    latched = np.where(driving, 0, np.where(state.driving, fault, state.latched_fault))
+    driving = inputs.enable & (state.driving | edge) & (fault == "")
+    latched = np.where(driving, "", np.where(state.driving, fault, state.latched_fault))
     moving = state.driving & driving  # in the tick that arms, the valves stay closed
     command = np.where(moving[..., None], limit_slew(machine, state, inputs), 0).astype(int)
     counter = (state.counter + 1) % 256
@@ -179,41 +148,46 @@ def still_counts(machine: Machine) -> Array:
     return np.maximum(1, STILL_ANGLE // machine.encoder_step)
 
 
-def active_fault(
+def fault_table(
     machine: Machine, state: GateState, inputs: GateInputs, motion: Array, now: Array
-) -> Array:
-    """Number (...) of the first entry that is true in the table of faults and nodes; 0: none."""
-    n, step = machine.n, machine.encoder_step
+) -> dict[str, Array]:
+    """What can be wrong: of the program (...), of joints (..., n), of all nodes (..., n + 1)."""
+    step = machine.encoder_step
     q = inputs.counts * step
     low = machine.column("q_min") - RANGE_MARGIN
     high = machine.column("q_max") + RANGE_MARGIN
     jump = JUMP_FACTOR * machine.q_dot_max * machine.dt + JUMP_ANGLE + step
-    limit = np.zeros(n)
+    limit = np.zeros(machine.n)
     limit[machine.driven] = machine.pwm_limit
-    faults = np.zeros((*now.shape, len(Fault), n + 1), bool)
-    faults[..., Fault.ERROR, 0] = inputs.error
-    faults[..., Fault.FLOODED, 0] = inputs.flooded
-    faults[..., Fault.OTHER_SENDER, 0] = inputs.other_sender
-    faults[..., Fault.LATE, 0] = ~(np.abs(now - state.time - machine.dt) <= machine.dt / 2)
-    faults[..., Fault.OPERATOR_LOST, 0] = ~inputs.alive
-    faults[..., Fault.NEVER_SEEN, :] = np.isneginf(inputs.heartbeat)
+    period = now - state.time
     age = now[..., None] - inputs.heartbeat  # below 0: nan and what is to come count as lost
-    faults[..., Fault.HEARTBEAT_LOST, :] = ~((age >= -machine.dt) & (age <= HEARTBEAT_TIMEOUT))
-    faults[..., Fault.NOT_OPERATIONAL, :] = inputs.nmt != OPERATIONAL
-    faults[..., Fault.SILENT, :n] = inputs.frames < 1
-    faults[..., Fault.MALFORMED, :n] = inputs.frames > 1
-    faults[..., Fault.OUT_OF_RANGE, :n] = (q < low) | (q > high)
-    faults[..., Fault.JUMPED, :n] = np.abs(q - state.counts * step) > jump
-    faults[..., Fault.FROZEN, :n] = motion > 3 * still_counts(machine) * step
-    faults[..., Fault.NO_COMMAND, :n] = ~(np.abs(inputs.command) <= limit)  # nan, too
-    faults[..., Fault.STOP, 0] = inputs.stop
-    return np.asarray(faults.reshape(*now.shape, -1).argmax(axis=-1))  # of no fault: 0
+    return {
+        "error": inputs.error,
+        "bus flooded": inputs.flooded,
+        "SYNC, NMT or valve frame of another sender": inputs.other_sender,
+        "tick late, or the clock was set": ~(np.abs(period - machine.dt) <= machine.dt / 2),
+        "operator's device lost": ~inputs.alive,
+        "never seen": np.isneginf(inputs.heartbeat),
+        "heartbeat lost": ~((age >= -machine.dt) & (age <= HEARTBEAT_TIMEOUT)),
+        "not operational": inputs.nmt != OPERATIONAL,
+        "silent": inputs.frames < 1,
+        "position doubled, not of 4 bytes, or FFFFFFFF": inputs.frames > 1,
+        "out of range": (q < low) | (q > high),
+        "jumped": np.abs(q - state.counts * step) > jump,
+        "frozen, or the joint does not move": motion > 3 * still_counts(machine) * step,
+        "no valid command": ~(np.abs(inputs.command) <= limit),  # nan, too
+        "stop asked for": inputs.stop,
+    }
 
 
-def fault_name(machine: Machine, number: int) -> str:
-    """Node and text of a number of `active_fault`; empty for no fault."""
-    row, node = divmod(number, machine.n + 1)
-    fault = Fault(row)  # type: ignore[call-arg]
-    if Fault.NEVER_SEEN <= fault <= Fault.NO_COMMAND:
-        return f"{[*machine.names, 'valve controller'][node]}: {fault.text}"
-    return fault.text
+def first_fault(machine: Machine, faults: dict[str, Array]) -> Array:
+    """Words (...) of the first fault in the table, and its first node; empty for no fault."""
+    nodes = np.array([*machine.names, "valve controller"])
+    words: Array = np.array("")
+    for text, found in reversed(faults.items()):
+        if found.ndim == faults["error"].ndim:
+            words = np.where(found, text, words)
+        else:
+            named = np.char.add(nodes[found.argmax(axis=-1)], f": {text}")
+            words = np.where(found.any(axis=-1), named, words)
+    return words

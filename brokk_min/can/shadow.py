@@ -14,7 +14,7 @@ from brokk_min import hw
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Array, Operator, OperatorInput
 from brokk_min.can.connection import Bus
-from brokk_min.can.safety_gate import GateInputs, fault_name
+from brokk_min.can.safety_gate import GateInputs
 from brokk_min.machine import PWM_MAX, Machine
 
 EARLY = 0.15  # of a tick, by which positions may come early (assumed)
@@ -29,6 +29,7 @@ class Shadow(hw.Drive):
         super().__init__(machine, controller, bus, operator or self.follow)
         bus.allowed = (canopen.NMT, canopen.SYNC) if sync else ()
         self.sync = sync
+        self.nodes.nmt[:] = canopen.OPERATIONAL  # until they say otherwise
         self.pairs: list[tuple[Array, Array]] = []  # would send, was sent; while it would drive
         self.faults: Counter[str] = Counter()  # ticks with each
 
@@ -53,7 +54,6 @@ class Shadow(hw.Drive):
             self.start_time = due - self.deadline_number * self.machine.dt
         super().wait()
         self.nodes.frames[:] = 0  # somebody else may ask more often
-        self.nodes.nmt[self.unheard] = canopen.OPERATIONAL
         recent = self.nodes.enable and self.bus.now() - self.nodes.valve_time < canopen.WATCHDOG
         sent = np.rint(PWM_MAX * self.nodes.u * recent)
         if self.gate.driving:
@@ -64,14 +64,9 @@ class Shadow(hw.Drive):
 
     def inputs(self, command: Array, counts: Array) -> GateInputs:
         """What the gate gets; nobody has set up heartbeats, and frames of others are no fault."""
-        heartbeat = np.where(self.unheard, self.bus.now(), self.nodes.heartbeat)
+        heartbeat = np.full(self.machine.n + 1, self.bus.now())
         inputs = super().inputs(command, counts)
         return inputs._replace(heartbeat=heartbeat, other_sender=np.array(False))
-
-    @property
-    def unheard(self) -> Array:
-        """Nodes that never sent a heartbeat, (n + 1,)."""
-        return np.isneginf(self.nodes.heartbeat)
 
     def control(self, counts: Array) -> Array:
         """The controller's command [counts of 127] (n,)."""
@@ -85,8 +80,8 @@ class Shadow(hw.Drive):
     def send_command(self, command: Array, counts: Array) -> None:
         """Pass the gate, and keep what it says."""
         super().send_command(command, counts)
-        if self.gate.active_fault and self.ticks > 1:  # the first tick always counts as late
-            self.faults[fault_name(self.machine, int(self.gate.active_fault))] += 1
+        if str(self.gate.active_fault) and self.ticks > 1:  # the first tick always counts as late
+            self.faults[str(self.gate.active_fault)] += 1
 
     def report(self) -> str:
         """Both commands compared joint by joint, and what the gate would have stopped."""
@@ -99,8 +94,5 @@ class Shadow(hw.Drive):
             lines.append(f"  {m.names[i]}: correlation {r}, mean difference {np.mean(a - b):+.1f}")
         if np.isinf(self.nodes.valve_time):
             lines.append(f"no valve frame with identifier 0x{m.valve_frame_id:X} came")
-        if self.unheard.any():
-            names = np.array([*m.names, "valve controller"])[self.unheard]
-            lines.append(f"no heartbeat came from {', '.join(names)}")
         lines += [f"the gate would have stopped {k} ticks: {f}" for f, k in self.faults.items()]
         return "\n".join(lines)

@@ -24,12 +24,9 @@ Frames = list[tuple[int, bytes]]  # identifiers and data
 class SimulatedMachine:
     """CiA 406 encoders and a valve controller on one bus, and a plant behind them.
 
-    A valve frame is refused if its counter, checksum or length is wrong, or if it is not the first
-    since a SYNC. The valves close on a refused frame, on two SYNCs without a frame between, and
-    after `WATCHDOG` without one. They stay closed until an NMT start and a neutral frame.
-    It starts at angles `q` [rad] (n,) at the time `now` [s]. The plant moves in steps of
-    `machine.plant_dt`, by the clock of this machine. `report` gets the reason when the valve
-    controller stops. ValueError: the machine does not fit the bus, see `canopen.check_bus`.
+    The valve controller keeps the rules of docs/hardware.md, and calls `report` with the reason
+    when it stops. It starts at angles `q` [rad] (n,) at the time `now` [s]. The plant moves in
+    steps of `machine.plant_dt`. ValueError: see `canopen.check_bus`.
     """
 
     def __init__(
@@ -69,8 +66,7 @@ class SimulatedMachine:
             self.steps += 1
             if then >= self.start + (self.heartbeats + 1) * canopen.HEARTBEAT_PERIOD:
                 self.heartbeats += 1
-                for node, state in self.nmt.items():
-                    out.append((canopen.HEARTBEAT + node, bytes([state])))
+                out += [(canopen.HEARTBEAT + node, bytes([x])) for node, x in self.nmt.items()]
         return out
 
     def receive(self, frame: Frame) -> Frames:

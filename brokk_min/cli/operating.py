@@ -12,7 +12,6 @@ from tyro.conf import Positional
 from brokk_min import hw
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script
-from brokk_min.can.safety_gate import fault_name
 from brokk_min.can.shadow import Shadow
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, check, default_policy, find_plant
@@ -103,7 +102,7 @@ def find_controller(machine: Machine, policy: Path | None, rl: bool) -> Controll
 
 def status(drive: hw.Drive) -> str:
     """One line: state, faults, goal and measured tool velocity [m/s], angles [rad], lateness."""
-    active = fault_name(drive.machine, int(drive.gate.active_fault))
+    active = str(drive.gate.active_fault)
     words = ["driving" if drive.gate.driving else "waiting" if active else "ready", drive.reason]
     words += [f"now {active}"] if active not in drive.reason else []  # what is in the way
     vectors: dict[str, Any] = {"v goal": drive.operator_input.v_goal}

@@ -93,7 +93,8 @@ def test_log_for_fit__by_hand():
 
 
 def test_read_telemetry__gives_at_each_sync_the_tick_before():
-    goal = OperatorInput((0.1, 0.0, -0.2), enable=True).pack()
+    goal = OperatorInput((0.1, 0.0, -0.12346), enable=True, stop=True).pack()
+    assert goal == struct.pack("<hhhB", 1000, 0, -1235, 0b111)
     q = np.array([0.0, 0.5, 0.6, 1.7, 1.2])
     frames = []
     for k in range(6):
@@ -109,6 +110,6 @@ def test_read_telemetry__gives_at_each_sync_the_tick_before():
     assert before.driving and last.driving and before.time == 0.2
     np.testing.assert_array_equal(before.q, np.rint((q + 0.04) / STEP) * STEP)
     np.testing.assert_allclose(before.u * 127, [50, 0, -80, 0, 0])
-    np.testing.assert_allclose(before.v_goal, [0.1, 0.0, -0.2])
+    np.testing.assert_allclose(before.v_goal, [0.1, 0.0, -0.1235])
     assert not gap.driving and not gap.v_goal.any()
     assert np.isnan(gap.q).all()

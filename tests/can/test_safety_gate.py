@@ -6,29 +6,15 @@ import numpy as np
 import pytest
 
 from brokk_min.can.canopen import checksum
-from brokk_min.can.safety_gate import GateInputs, GateState, expected_motion, gate, gate_start
+from brokk_min.can.safety_gate import GateInputs, GateState, gate
 from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
 DT = 0.05
 
 
-def test_expected_motion__counts_from_one_and_a_half_of_the_machines_widest_dead_zone():
-    """Of 0.07 and 0.16 the second, one joint's downward: it holds for all of them, both ways."""
-    joint = replace(BROKK_170.joints[4], dead_zone=(0.07, 0.16))
-    wide = replace(BROKK_170, name="wide", joints=(*BROKK_170.joints[:4], joint))
-    state = gate_start(BROKK_170)
-    for sent, opening in ((30, 0.0), (40, (40 - 30.48) / (80 - 30.48))):
-        state.sent[0] = sent
-        _, motion = expected_motion(wide, state, np.zeros(5, int))
-        assert motion[0] == pytest.approx(0.4 * 0.2 * 0.05 * opening, rel=1e-3)
-
-
-# --- a plain rewriting ---------------------------------------------------------------------------
-
-
 def tight_machine():
-    """The Brokk with ranges such that whole counts hit the gate's borders exactly."""
+    """The Brokk with ranges such that whole counts hit the gate's borders, and a wide dead zone."""
 
     def edge(near, margin):
         """A limit near `near` to which adding `margin` gives a whole number of counts."""
@@ -42,14 +28,15 @@ def tight_machine():
         replace(j, q_min=edge(j.q_min, low), q_max=edge(j.q_max, high), cylinder_base=0.0)
         for j, (low, high) in zip(BROKK_170.joints, margins, strict=True)
     )
-    return replace(BROKK_170, name="tight", joints=joints)
+    wide = replace(joints[4], dead_zone=(0.07, 0.16))
+    return replace(BROKK_170, name="tight", joints=(*joints[:4], wide))
 
 
 def plain_motion(machine, s, count, j):
     """The place that the encoder of joint `j` has stayed at, and the motion [rad] since then."""
     joint = machine.joints[j]
     sent = s.sent[j].tolist()
-    idle = 1.5 * machine.dead_zones[0, 0]
+    idle = 1.5 * max(max(each.dead_zone) for each in machine.joints)
     smallest = min(sent) / 127 if sent[-1] > 0 else -max(sent) / 127
     if smallest <= idle or abs(int(count) - int(s.place[j])) > 1:
         return int(count), 0.0  # a count of 12 bits is above 1.5 mrad
@@ -58,31 +45,44 @@ def plain_motion(machine, s, count, j):
     return int(s.place[j]), float(s.motion[j]) + least
 
 
-def plain_fault(machine, s, i, now):
-    """The first fault of one gate, with the promised numbers written out."""
+def plain_node(machine, s, i, now, node):
+    """What is wrong with one node, with the promised numbers written out."""
     faults = {
-        (1, 0): i.error,
-        (2, 0): i.flooded,
-        (3, 0): i.other_sender,
-        (4, 0): not 0.5 * DT <= now - s.time <= 1.5 * DT,
-        (5, 0): not i.alive,
-        (15, 0): i.stop,
+        "never seen": i.heartbeat[node] == -np.inf,
+        "heartbeat lost": not -DT <= now - i.heartbeat[node] <= 0.110,
+        "not operational": i.nmt[node] != 5,
     }
-    for node in range(6):
-        faults[6, node] = i.heartbeat[node] == -np.inf
-        faults[7, node] = not -DT <= now - i.heartbeat[node] <= 0.110
-        faults[8, node] = i.nmt[node] != 5
-    for j, joint in enumerate(machine.joints):
-        c, old = int(i.counts[j]), int(s.counts[j])
-        jump = 2 * max(joint.q_dot_up, joint.q_dot_down) * DT + 0.0045 + STEP
-        limit = 80 if joint.driven else 0
-        faults[9, j] = i.frames[j] == 0
-        faults[10, j] = i.frames[j] >= 2
-        faults[11, j] = not joint.q_min - 0.05 <= c * STEP <= joint.q_max + 0.05
-        faults[12, j] = abs(c * STEP - old * STEP) > jump
-        faults[13, j] = plain_motion(machine, s, c, j)[1] > 3 * STEP
-        faults[14, j] = not -limit <= i.command[j] <= limit
-    return min((kind * 6 + node for (kind, node), found in faults.items() if found), default=0)
+    if node == 5:
+        return faults
+    joint, q, before = machine.joints[node], i.counts[node] * STEP, s.counts[node] * STEP
+    jump = 2 * max(joint.q_dot_up, joint.q_dot_down) * DT + 0.0045 + STEP
+    limit = 80 if joint.driven else 0
+    return faults | {
+        "silent": i.frames[node] == 0,
+        "position doubled, not of 4 bytes, or FFFFFFFF": i.frames[node] >= 2,
+        "out of range": not joint.q_min - 0.05 <= q <= joint.q_max + 0.05,
+        "jumped": abs(q - before) > jump,
+        "frozen, or the joint does not move": plain_motion(machine, s, i.counts[node], node)[1]
+        > 3 * STEP,
+        "no valid command": not -limit <= i.command[node] <= limit,
+    }
+
+
+def plain_fault(machine, s, i, now):
+    """The first fault of one gate."""
+    program = {
+        "error": i.error,
+        "bus flooded": i.flooded,
+        "SYNC, NMT or valve frame of another sender": i.other_sender,
+        "tick late, or the clock was set": not 0.5 * DT <= now - s.time <= 1.5 * DT,
+        "operator's device lost": not i.alive,
+    }
+    found = [words for words, fault in program.items() if fault]
+    nodes = [plain_node(machine, s, i, now, node) for node in range(6)]
+    for words in nodes[0]:
+        names = zip((*machine.names, "valve controller"), nodes)
+        found += [f"{name}: {words}" for name, faults in names if faults.get(words)]
+    return [*found, "stop asked for" if i.stop else ""][0]
 
 
 def plain_gate(machine, s, i, now):
@@ -104,7 +104,7 @@ def plain_gate(machine, s, i, now):
         driving=driving,
         armed_once=bool(s.armed_once) or driving,
         active_fault=fault,
-        latched_fault=0 if driving else fault if s.driving else int(s.latched_fault),
+        latched_fault="" if driving else fault if s.driving else str(s.latched_fault),
         enable=bool(i.enable) if trusted else bool(i.enable or s.enable),
         time=now,
         counter=counter,
@@ -178,8 +178,8 @@ class Cases:
         return GateState(
             driving=self.some(0.6),
             armed_once=self.some(0.5),
-            active_fault=rng.integers(0, 96, num),
-            latched_fault=rng.integers(0, 96, num),
+            active_fault=rng.choice(["", "error"], num),
+            latched_fault=rng.choice(["", "q4: jumped"], num),
             enable=self.some(0.5),
             time=-self.put(np.full(num, DT), 0.1, *late),
             counter=rng.choice([0, 1, 127, 254, 255], num),
@@ -192,21 +192,20 @@ class Cases:
 
 @pytest.mark.parametrize(("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1)])
 def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
-    cases = Cases(machine, 3000, seed)
-    for shape in ((3000,), (4, 750), (3, 10, 100)):
-        given = [
-            type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))
-            for part in (cases.state, cases.inputs)
-        ]
-        state, frame = gate(machine, *given, np.zeros(shape))
-        assert frame.dtype == np.uint8 and frame.shape == (*shape, 8)
-        frame = frame.reshape(3000, 8)
-        np.testing.assert_array_equal(np.delete(frame, 6, axis=1), [f for _, f in cases.expected])
-        np.testing.assert_array_equal(frame[:, 6], checksum(np.delete(frame, 6, axis=1)))
-        for name, found in zip(GateState._fields, state, strict=True):
-            expected = np.array([getattr(s, name) for s, _ in cases.expected])
-            assert np.shape(found) == (*shape, *expected.shape[1:]), name
-            np.testing.assert_array_equal(np.reshape(found, expected.shape), expected, name)
-    faults = {s.active_fault // 6 for s, _ in cases.expected}
-    assert faults == set(range(16)), "each fault comes up"
+    cases, shape = Cases(machine, 3000, seed), (3, 10, 100)
+    given = [
+        type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))
+        for part in (cases.state, cases.inputs)
+    ]
+    state, frame = gate(machine, *given, np.zeros(shape))
+    assert frame.dtype == np.uint8 and frame.shape == (*shape, 8)
+    frame = frame.reshape(3000, 8)
+    np.testing.assert_array_equal(np.delete(frame, 6, axis=1), [f for _, f in cases.expected])
+    np.testing.assert_array_equal(frame[:, 6], checksum(np.delete(frame, 6, axis=1)))
+    for name, found in zip(GateState._fields, state, strict=True):
+        expected = np.array([getattr(s, name) for s, _ in cases.expected])
+        assert np.shape(found) == (*shape, *expected.shape[1:]), name
+        np.testing.assert_array_equal(np.reshape(found, expected.shape), expected, name)
+    faults = {s.active_fault.split(": ")[-1] for s, _ in cases.expected}
+    assert len(faults) == 16, "each fault comes up"
     assert sum(bool(s.driving and any(f[:5])) for s, f in cases.expected) > 300

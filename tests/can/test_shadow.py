@@ -95,7 +95,6 @@ def test_report__by_hand():
         "  q4: correlation -0.50, mean difference -1.0",
         "  q5: correlation none, mean difference +0.0",
         "no valve frame with identifier 0x210 came",
-        "no heartbeat came from q1, q2, q3, q4, q5, valve controller",
         "the gate would have stopped 2 ticks: q3: jumped",
     ]
 
@@ -109,7 +108,6 @@ def test_shadow__follows_the_positions_that_somebody_else_asks_for(period):
     world.run(4.0)
     assert left == [] and len(world.drive.pairs) == pytest.approx(80, abs=5)
     assert world.drive.faults.total() <= 2  # until it has found the first positions
-    assert "no heartbeat came from q1, q2, q3, q4, q5, valve controller" in world.drive.report()
 
 
 def test_shadow__agrees_with_somebody_who_sends_what_it_would():

@@ -94,7 +94,7 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
     world.downward = recording(out)
     assert world.drive.tick() and world.drive.reason == "tick late, or the clock was set"
     world.run(1.0)
-    assert world.drive.gate.active_fault == 0
+    assert world.drive.gate.active_fault == ""
     assert {data for can_id, data in out if can_id == 0x080} == {b""}
     assert not [frame for frame in out if frame[0] == 0x210]
     world.operator.enable, world.operator.v = True, (0.0, 0.0, 0.0)
@@ -197,12 +197,12 @@ def test_tick__leaves_a_fault_by_a_new_edge_only(world):
     world.downward = recording(out)
     world.simulated.nmt[4] = 127
     world.run(0.4)
-    assert drive.reason == "fault: q4: not operational" and drive.gate.active_fault
+    assert drive.reason == "fault: q4: not operational" and drive.gate.active_fault != ""
     assert 0x000 not in dict(out)
     world.operator.enable = False
     world.run(0.2)
     assert {data for can_id, data in out if can_id == 0x000} == {b"\x01\x00"}
-    assert drive.reason == "fault: q4: not operational" and not drive.gate.active_fault
+    assert drive.reason == "fault: q4: not operational" and drive.gate.active_fault == ""
     out.clear()
     world.run(0.2)
     assert 0x000 not in dict(out)
@@ -223,8 +223,7 @@ def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world):
         stall = {40: 0.13, 80: 0.052, 90: 0.26}.get(k, 0.004)  # a tick takes some time
         world.controller.act = lambda stall=stall: world.sleep(stall)
         world.drive.tick()
-    assert world.drive.ticks == 120
-    ticks = (np.array(world.syncs[1:]) - begun) / 0.05  # without that of the start
+    ticks = (np.array(world.syncs) - begun) / 0.05
     late = np.flatnonzero(ticks - np.floor(ticks + 0.03) > 0.03)
     assert late.tolist() == [41, 81, 91]  # one tick at once after each stall, then the grid again
     assert np.diff(ticks).min() > 0.3
