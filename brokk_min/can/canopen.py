@@ -50,7 +50,7 @@ class Nodes:
     def __init__(self, machine: Machine) -> None:
         nodes = node_numbers(machine)
         self.machine = machine
-        self.own_ids = (NMT, SYNC, machine.valve_frame_id)  # only this program sends them
+        self.own_ids: tuple[int, ...] = (NMT, SYNC, machine.valve_frame_id)  # nobody else's
         self.received = self.others = 0  # frames of this tick; of them in `own_ids`, not sent
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}

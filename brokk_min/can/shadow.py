@@ -14,7 +14,6 @@ from brokk_min import hw
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Array, Operator, OperatorInput
 from brokk_min.can.connection import Bus
-from brokk_min.can.safety_gate import GateInputs
 from brokk_min.machine import PWM_MAX, Machine
 
 EARLY = 0.15  # of a tick, by which positions may come early (assumed)
@@ -29,6 +28,7 @@ class Shadow(hw.Drive):
         super().__init__(machine, controller, bus, operator or self.follow)
         bus.allowed = (canopen.NMT, canopen.SYNC) if sync else ()
         self.sync = sync
+        self.nodes.own_ids = ()  # frames of others are no fault
         self.nodes.nmt[:] = canopen.OPERATIONAL  # until they say otherwise
         self.pairs: list[tuple[Array, Array]] = []  # would send, was sent; while it would drive
         self.faults: Counter[str] = Counter()  # ticks with each
@@ -53,7 +53,10 @@ class Shadow(hw.Drive):
             due = self.positions_time + (1 - EARLY) * self.machine.dt
             self.start_time = due - self.deadline_number * self.machine.dt
         super().wait()
+        if (fault := str(self.gate.active_fault)) and self.ticks > 2:  # the first tick is late
+            self.faults[fault] += 1
         self.nodes.frames[:] = 0  # somebody else may ask more often
+        self.nodes.heartbeat[:] = self.bus.now()  # nobody has set up heartbeats
         recent = self.nodes.enable and self.bus.now() - self.nodes.valve_time < canopen.WATCHDOG
         sent = np.rint(PWM_MAX * self.nodes.u * recent)
         if self.gate.driving:
@@ -61,12 +64,6 @@ class Shadow(hw.Drive):
         moved_by = self.gate.sent.copy()  # history and gate go on from what was sent
         moved_by[:, -1] = sent
         self.gate = self.gate._replace(sent=moved_by)
-
-    def inputs(self, command: Array, counts: Array) -> GateInputs:
-        """What the gate gets; nobody has set up heartbeats, and frames of others are no fault."""
-        heartbeat = np.full(self.machine.n + 1, self.bus.now())
-        inputs = super().inputs(command, counts)
-        return inputs._replace(heartbeat=heartbeat, other_sender=np.array(False))
 
     def control(self, counts: Array) -> Array:
         """The controller's command [counts of 127] (n,)."""
@@ -76,12 +73,6 @@ class Shadow(hw.Drive):
         else:
             self.positions_time = self.bus.now()
         return super().control(counts)
-
-    def send_command(self, command: Array, counts: Array) -> None:
-        """Pass the gate, and keep what it says."""
-        super().send_command(command, counts)
-        if str(self.gate.active_fault) and self.ticks > 1:  # the first tick always counts as late
-            self.faults[str(self.gate.active_fault)] += 1
 
     def report(self) -> str:
         """Both commands compared joint by joint, and what the gate would have stopped."""

@@ -46,10 +46,8 @@ class SimulatedMachine:
         *self.encoders, self.controller = canopen.node_numbers(machine)
         self.nmt = dict.fromkeys([*self.encoders, self.controller], PRE_OPERATIONAL)
         self.valid = now  # time of the last valid valve frame
-        self.u: Array = np.zeros(machine.n)
-        self.enabled = False  # by a neutral frame with the enable byte, until the byte is cleared
-        self.counter: int | None = None  # of the last valve frame; after None any may come
         self.waiting = False  # for a valve frame, since the last SYNC
+        self._close_valves()
 
     @property
     def next_step(self) -> float:
@@ -114,9 +112,9 @@ class SimulatedMachine:
             self.u = u * self.enabled
 
     def _close_valves(self) -> None:
-        self.u = np.zeros(self.machine.n)
-        self.enabled = False
-        self.counter = None
+        self.u: Array = np.zeros(self.machine.n)
+        self.enabled = False  # by a neutral frame with the enable byte, until the byte is cleared
+        self.counter: int | None = None  # of the last valve frame; after None any may come
 
     def _trip(self, reason: str) -> None:
         if self.nmt[self.controller] == OPERATIONAL:
@@ -126,11 +124,9 @@ class SimulatedMachine:
 
     def _on_sdo(self, node: int, data: bytes) -> bytes:
         """Objects are read; what is written has its fixed value already."""
-        command, *address, _ = struct.unpack("<BHBI", data)
-        objects = canopen.encoder_objects(self.machine, node)
-        value, _ = objects.get((*address,), (0, ""))
-        answer = (0x43, value) if command == 0x40 else (0x60, 0)
-        return struct.pack("<BHBI", answer[0], *address, answer[1])
+        command, index, sub, _ = struct.unpack("<BHBI", data)
+        value, _ = canopen.encoder_objects(self.machine, node).get((index, sub), (0, ""))
+        return struct.pack("<BHBI", 0x43 if command == 0x40 else 0x60, index, sub, value)
 
 
 def start_pose(machine: Machine) -> Array:
