@@ -2,13 +2,14 @@
 
 import struct
 from functools import partial, reduce
+from itertools import cycle, islice
 from typing import NamedTuple
 
 import can
 import numpy as np
 from helpers_bus import ConstantCommand, HoldingOperator, World, once, only, raises
 
-from brokk_min.can.canopen import Frame, encoder_raw, valve_frame
+from brokk_min.can.canopen import encoder_raw, valve_frame
 from brokk_min.machine import BROKK_170
 
 COMMAND = (60, 0, 60, 60, 60)
@@ -43,73 +44,39 @@ def freeze(world, node, command=None):
     up(0x180 + node, lambda _: [place])(world)
 
 
-def due(world, held):
-    """Remove and return the frames whose time has come."""
-    frames = [frame for then, frame in held if then <= world.time]
-    held[:] = [item for item in held if item[0] > world.time]
-    return frames
-
-
 def delay(world, node, draw):
     """Positions come `draw()` seconds late."""
     tpdo, held = 0x180 + node, []
     up(tpdo, lambda data: held.append((world.time + draw(), (tpdo, data))) or [])(world)
-    world.noise = lambda: due(world, held)
 
+    def due():
+        frames = [frame for then, frame in held if then <= world.time]
+        held[:] = [item for item in held if item[0] > world.time]
+        return frames
 
-def delay_valve_frames(world, seconds):
-    held = []
-
-    def noise():
-        for data in due(world, held):
-            world.simulated.receive(Frame(world.time, 0x210, data))
-        return []
-
-    world.downward = only(0x210, lambda d: held.append((world.time + seconds, d)) or [])
-    world.noise = noise
+    world.noise = due
 
 
 def flood(world, foreign=False, rate=2000):
-    """Frames of any identifier; pairs of identifier and length that came, and how many exist."""
+    """Frames of each identifier and length, or of foreign identifiers alone; those that came."""
     rng = np.random.default_rng(0)
     nodes = (1, 2, 3, 4, 5, 16)
     known = {0, 0x80, 0x210, *(base + n for base in (0x180, 0x580, 0x600, 0x700) for n in nodes)}
-    ids = rng.permutation([i for i in range(2048) if not foreign or i not in known])
-    assert len(ids) % 3  # no factor in common with the nine lengths: each pair has its turn
-    begun, count, seen = world.time, 0, set()
+    ids = [i for i in range(2048) if not foreign or i not in known]
+    pairs = cycle(rng.permutation([(i, length) for i in ids for length in range(9)]).tolist())
+    begun, came = world.time, []
 
     def noise():
-        nonlocal count
-        out = []
-        while begun + (count + 1) / rate <= world.time:
-            count += 1
-            out.append((int(ids[count % len(ids)]), rng.bytes(count % 9)))
-        seen.update((can_id, len(data)) for can_id, data in out)
-        return out
+        num = int((world.time - begun) * rate) - len(came)
+        frames = [(can_id, rng.bytes(length)) for can_id, length in islice(pairs, num)]
+        came.extend(frames)
+        return frames
 
     world.noise = noise
-    return seen, 9 * len(ids)
+    return came
 
 
 foreign_flood = partial(flood, foreign=True)
-
-
-def intruder(world, after):
-    """Somebody else sends a well-formed frame of 77 counts after each of our frames of an id."""
-    counter = 0
-
-    def follow(can_id, data):
-        nonlocal counter
-        out = [(can_id, data)]
-        counter = data[5] if can_id == 0x210 else counter
-        if can_id == after:
-            counter += 1
-            theirs = valve_frame([77, 0, 0, 0, 0], counter % 256, 1)
-            out.append((0x210, theirs.tobytes()))
-            world.answers.append(out[-1])
-        return out
-
-    world.downward = follow
 
 
 def foreign(world, can_id, data):
@@ -145,6 +112,7 @@ def command(joint, value):
 
 # what goes wrong, and words of the reason that the program gives, or why it cannot find it
 SEND_ERROR = raises(can.CanOperationError("no buffer space"))
+THEIRS = valve_frame([77, 0, 0, 0, 0], 0, 1).tobytes()
 OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
 NOT_OPERATIONAL = "valve controller: not operational"
 DOUBLED = "position doubled, not of 4 bytes"
@@ -153,15 +121,14 @@ FAULTS = {
     "valve controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
     "flood on all identifiers": (flood, ""),
     "flood of 6,000 foreign frames a second": (partial(foreign_flood, rate=6e3), "bus flooded"),
-    "second sender after each of our valve frames": (partial(intruder, after=0x210), ""),
-    "second sender after each SYNC": (partial(intruder, after=0x080), OTHER_SENDER),
     "foreign SYNC": (partial(foreign, can_id=0x080, data=b""), OTHER_SENDER),
+    "foreign NMT": (partial(foreign, can_id=0x000, data=b"\x80\x10"), OTHER_SENDER),
+    "foreign valve frame": (partial(foreign, can_id=0x210, data=THEIRS), OTHER_SENDER),
     "bus closed": (close_bus, "error (CanOperationError: closed)"),
     "send error of all frames": (put("downward", SEND_ERROR), "(CanOperationError"),
     "valve frame lost": (valves(lambda d: []), NOT_OPERATIONAL),
     "valve frame doubled": (valves(lambda d: [d, d]), NOT_OPERATIONAL),
     "valve frame's bit flipped": (valves(lambda d: [bytes([d[0] ^ 4, *d[1:]])]), NOT_OPERATIONAL),
-    "valve frames 60 ms late": (partial(delay_valve_frames, seconds=0.06), NOT_OPERATIONAL),
     "joystick unplugged": (put("operator.alive", False), "operator's device lost"),
     "joystick raises": (put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
     "enable released": (put("operator.enable", False), ""),
@@ -197,7 +164,6 @@ NOT_FOUND = {
     "q3 a tick late, without a gap": (partial(repeat_once, node=3), "no time, no number"),
     "slow q3 frozen": (partial(freeze, node=3, command=(15, 0, 15, 15, 15)), "it takes longer"),
     "q3 drifts by 60 counts/s": (partial(drift, node=3, speed=60), "it looks like motion"),
-    "valve frames 30 ms late": (partial(delay_valve_frames, seconds=0.03), "within the tick"),
     "4,500 foreign frames a second": (partial(foreign_flood, rate=4500), "harmless"),
 }
 
