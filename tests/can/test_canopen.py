@@ -135,8 +135,8 @@ def dictionary():
     """As much of CiA 406 as the program asks of an encoder."""
     u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
     objects = ObjectDictionary()
-    for name, index in (("TPDO1", 0x1800), ("TPDO1 mapping", 0x1A00)):
-        objects.add_object(ODRecord(name, index))
+    for index in (0x1800, 0x1A00):
+        objects.add_object(ODRecord(f"TPDO1 {index}", index))
     for name, index, sub, kind, value in (
         ("heartbeat", 0x1017, 0, u16, 0),
         ("identifier", 0x1800, 1, u32, 0x181),
@@ -147,8 +147,7 @@ def dictionary():
         ("units per revolution", 0x6501, 0, u32, 4096),
     ):
         entry = ODVariable(name, index, sub)
-        entry.data_type = kind
-        entry.default = value
+        entry.data_type, entry.default = kind, value
         (objects[index].add_member if index in objects else objects.add_object)(entry)
     return objects
 

@@ -57,13 +57,13 @@ def plain_node(machine, s, i, now, node):
     joint, q, before = machine.joints[node], i.counts[node] * STEP, s.counts[node] * STEP
     jump = 2 * max(joint.q_dot_up, joint.q_dot_down) * DT + 0.0045 + STEP
     limit = 80 if joint.driven else 0
+    _, motion = plain_motion(machine, s, i.counts[node], node)
     return faults | {
         "silent": i.frames[node] == 0,
         "position doubled, not of 4 bytes, or FFFFFFFF": i.frames[node] >= 2,
         "out of range": not joint.q_min - 0.05 <= q <= joint.q_max + 0.05,
         "jumped": abs(q - before) > jump,
-        "frozen, or the joint does not move": plain_motion(machine, s, i.counts[node], node)[1]
-        > 3 * STEP,
+        "frozen, or the joint does not move": motion > 3 * STEP,
         "no valid command": not -limit <= i.command[node] <= limit,
     }
 
@@ -114,9 +114,6 @@ def plain_gate(machine, s, i, now):
         motion=[angle for _, angle in stays],
     )
     return state, [*(x if x >= 0 else 255 + x for x in m), counter, int(driving)]
-
-
-# --- cases that lie on the borders ---------------------------------------------------------------
 
 
 class Cases:

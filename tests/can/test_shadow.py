@@ -6,7 +6,16 @@ from functools import partial
 import can
 import numpy as np
 import pytest
-from helpers_bus import START, ConstantCommand, HoldingOperator, RemoteControl, World, only
+from helpers_bus import (
+    START,
+    ConstantCommand,
+    HoldingOperator,
+    RemoteControl,
+    World,
+    only,
+    recording,
+    unchanged,
+)
 from helpers_cli import run
 
 from brokk_min._files import SHIPPED
@@ -31,7 +40,7 @@ def shadowed(machine=BROKK_170, controller=None, operator=None, log=None, sync=F
     controller = controller or ConstantCommand(0, 0, 0, 10, 0)
     world, left = World(controller, operator, log=log), []
     world.noise = RemoteControl(world, partial(to_and_fro, Q4), period)
-    world.downward = lambda can_id, data: left.append((can_id, data)) or [(can_id, data)]
+    world.downward = recording(left)
     world.drive = Shadow(machine, controller, world.bus, operator, sync)
     world.drive.begin()
     return world, left
@@ -59,8 +68,8 @@ def test_shadow__compares_and_logs_what_it_would_send_and_sends_nothing(tmp_path
     would = [would for would, _ in drive.pairs]
     expected = [valve_frame(m, 0, 1).tobytes()[:5] for m in would]
     assert [data[:5] for data in logged][: len(would)] == expected
-    (recording,) = log_for_fit(BROKK_170, frames).recordings  # the shadow as a record for `fit`
-    assert set(np.rint(127 * recording.u[:, Q4])) == {40, 0, -40}
+    (recorded,) = log_for_fit(BROKK_170, frames).recordings  # the shadow as a record for `fit`
+    assert set(np.rint(127 * recorded.u[:, Q4])) == {40, 0, -40}
     assert f"would send {' '.join(f'{x / 127:+.2f}' for x in would[-1])}, sent +0.00 +0.00 " in (
         status(drive)
     )
@@ -101,10 +110,10 @@ def test_report__by_hand():
 
 @pytest.mark.parametrize("period", [0.01, 0.025, 0.05])
 def test_shadow__follows_the_positions_that_somebody_else_asks_for(period):
-    """Without heartbeats, too: nobody has set them up."""
+    """Heartbeats may end: nobody has set them up."""
     world, left = shadowed(period=period)
     world.noise.command = lambda tick: np.zeros(5)
-    world.upward = lambda can_id, data: [(can_id, data)] * (can_id < 0x700)
+    world.upward = lambda i, data: [(i, data)] * (i < 0x700 or (i < 0x710 and world.time < 1))
     world.run(4.0)
     assert left == [] and len(world.drive.pairs) == pytest.approx(80, abs=5)
     assert world.drive.faults.total() <= 2  # until it has found the first positions
@@ -131,7 +140,7 @@ def test_shadow__finds_the_faults_of_the_gate_and_goes_on():
     compared = len(world.drive.pairs)
     world.upward = only(0x183, lambda data: [])
     world.run(0.5)
-    world.upward = lambda can_id, data: [(can_id, data)]
+    world.upward = unchanged
     world.run(1.0)
     silent = world.drive.faults["q3: silent"]
     assert left == [] and 5 <= silent <= 12
