@@ -5,7 +5,6 @@ It plays the part of a real Brokk on the bus; the program that drives it cannot 
 
 import gc
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -24,21 +23,14 @@ Frames = list[tuple[int, bytes]]  # identifiers and data
 class SimulatedMachine:
     """CiA 406 encoders and a valve controller on one bus, and a plant behind them.
 
-    The valve controller keeps the rules of docs/hardware.md, and calls `report` with the reason
-    when it stops. It starts at angles `q` [rad] (n,) at the time `now` [s]. The plant moves in
-    steps of `machine.plant_dt`. ValueError: see `canopen.check_bus`.
+    The valve controller keeps the rules of docs/hardware.md. The machine starts at angles `q` [rad]
+    (n,) at the time `now` [s], and the plant moves in steps of `machine.plant_dt`.
+    ValueError: see `canopen.check_bus`.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        q: ArrayLike,
-        now: float,
-        plant: Plant = PLANT,
-        report: Callable[[str], object] = lambda reason: None,
-    ) -> None:
+    def __init__(self, machine: Machine, q: ArrayLike, now: float, plant: Plant = PLANT) -> None:
         canopen.check_bus(machine)
-        self.machine, self.plant, self.report = machine, plant, report
+        self.machine, self.plant = machine, plant
         self.fine = replace(machine, rate=1 / machine.plant_dt)  # of which a tick is one step
         self.state = plant.reset(self.fine, np.array(q, float))
         self.start = now
@@ -46,6 +38,7 @@ class SimulatedMachine:
         *self.encoders, self.controller = canopen.node_numbers(machine)
         self.nmt = dict.fromkeys([*self.encoders, self.controller], PRE_OPERATIONAL)
         self.valid = now  # time of the last valid valve frame
+        self.reasons: list[str] = []  # why the valve controller stopped
         self.waiting = False  # for a valve frame, since the last SYNC
         self._close_valves()
 
@@ -118,7 +111,7 @@ class SimulatedMachine:
 
     def _trip(self, reason: str) -> None:
         if self.nmt[self.controller] == OPERATIONAL:
-            self.report(reason)
+            self.reasons.append(reason)
         self._close_valves()
         self.nmt[self.controller] = PRE_OPERATIONAL
 
@@ -144,11 +137,7 @@ def simulate(machine: Machine, interface: str, channel: str, plant: Plant = PLAN
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:
         start = bus.now()
-
-        def report(reason: str) -> None:
-            print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
-
-        simulated = SimulatedMachine(machine, start_pose(machine), start, plant, report)
+        simulated = SimulatedMachine(machine, start_pose(machine), start, plant)
         answers: Frames = []
         while not signals:
             for can_id, data in answers:
@@ -156,3 +145,6 @@ def simulate(machine: Machine, interface: str, channel: str, plant: Plant = PLAN
             frame = bus.recv(max(0.0, simulated.next_step - bus.now()))
             answers = simulated.advance(bus.now())
             answers += simulated.receive(frame) if frame else []
+            while simulated.reasons:
+                reason = simulated.reasons.pop(0)
+                print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)

@@ -15,11 +15,10 @@ CONTROLLER = 16
 
 
 class Machine(SimulatedMachine):
-    """It begins at 100 s and keeps the reasons why it stops."""
+    """It begins at 100 s."""
 
     def __init__(self):
-        self.reasons = []
-        super().__init__(BROKK_170, START, 100.0, Recorder(), self.reasons.append)
+        super().__init__(BROKK_170, START, 100.0, Recorder())
 
     def take(self, can_id, data=b"", now=100.0):
         return self.receive(Frame(now, can_id, data))
