@@ -103,9 +103,8 @@ def check_bus(machine: Machine) -> None:
     require(fits, "valve_frame_id", "0x181 to 0x57F, of no encoder", f"0x{valves:03X}")
     for joint in machine.joints:
         require(joint.kind == "revolute", f"{joint.name}.kind", "revolute on a bus", joint.kind)
-        width = joint.q_max - joint.q_min
-        fits = width <= 2 * np.pi - 0.1
-        require(fits, f"{joint.name}.q_max", "a range 0.1 rad below a turn", f"{width:.2f} rad")
+        width = joint.q_max - joint.q_min  # less than a turn
+        require(width < 6.18, f"{joint.name}.q_max", "a range below 6.18 rad", f"{width:.2f} rad")
     slowest = 1.5 / WATCHDOG  # Hz, because a tick may be late by half
     require(machine.rate >= slowest, "rate", f"{slowest:g} Hz or more (watchdog)", machine.rate)
 
@@ -130,8 +129,8 @@ def set_up_nodes(bus: Any, machine: Machine) -> None:
             require(found == value, what, meaning, f"{found} (0x{found:X})")
     bus.send(NMT, PRE_OPERATIONAL_ALL)
     for joint in machine.joints:
-        sdo(bus, joint.encoder_node, (0x1017, 0), round(1e3 * HEARTBEAT_PERIOD), size=2)  # ms
-        sdo(bus, joint.encoder_node, (0x1800, 2), 1, size=1)  # a position after every SYNC
+        sdo(bus, joint.encoder_node, (0x1017, 0), struct.pack("<H", round(1e3 * HEARTBEAT_PERIOD)))
+        sdo(bus, joint.encoder_node, (0x1800, 2), b"\x01")  # a position after every SYNC
     bus.send(NMT, START_ALL)
 
 
@@ -146,15 +145,13 @@ def encoder_objects(machine: Machine, node: int) -> dict[tuple[int, int], tuple[
     }
 
 
-def sdo(
-    bus: Any, node: int, address: tuple[int, int], value: int | None = None, size: int = 4
-) -> int:
-    """Read an object of a node by its index and subindex, or write `value` of `size` bytes to it.
+def sdo(bus: Any, node: int, address: tuple[int, int], data: bytes = b"") -> int:
+    """Read an object of a node by its index and subindex, or write up to four bytes to it.
 
     ValueError: the node does not answer, or refuses.
     """
-    command = 0x40 if value is None else 0x23 | (4 - size) << 2
-    request = struct.pack("<BHBI", command, *address, value or 0)
+    command = 0x23 | (4 - len(data)) << 2 if data else 0x40
+    request = struct.pack("<BHB4s", command, *address, data)
     bus.send(SDO_REQUEST + node, request)
     what = "node {}: object 0x{:04X}:{:02X}".format(node, *address)
     end = bus.now() + SDO_TIMEOUT

@@ -11,6 +11,7 @@ from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
 DT = 0.05
+SHAPE = (3, 10, 100)  # of the gates
 
 
 def tight_machine():
@@ -119,37 +120,35 @@ def plain_gate(machine, s, i, now):
 class Cases:
     """Random states and inputs, mostly sound, each with about one value on or next to a border."""
 
-    def __init__(self, machine, num, seed):
-        self.machine, self.num, self.rng = machine, num, np.random.default_rng(seed)
+    def __init__(self, machine, seed):
+        self.machine, self.rng = machine, np.random.default_rng(seed)
         self.inputs = self.draw_inputs()
         self.state = self.draw_state()
-        rows = zip(zip(*self.state), zip(*self.inputs))
-        self.expected = [plain_gate(machine, GateState(*s), GateInputs(*i), 0) for s, i in rows]
 
     def some(self, p, *shape):
-        return self.rng.random((self.num, *shape)) < p
+        return self.rng.random((*SHAPE, *shape)) < p
 
     def put(self, array, p, *values):
         chosen = self.rng.choice(values, array.shape)
-        return np.where(self.some(p, *array.shape[1:]), chosen, array)
+        return np.where(self.rng.random(array.shape) < p, chosen, array)
 
     def draw_inputs(self):
-        rng, num, n = self.rng, self.num, self.machine.n
+        rng, n = self.rng, self.machine.n
         low, high = self.machine.column("q_min"), self.machine.column("q_max")
         borders = [np.rint(x / STEP) for x in (low - 0.05, low + 0.02, high - 0.02, high + 0.05)]
-        near = np.stack(borders, -1)[np.arange(n), rng.integers(0, 4, (num, n))]
-        near = near + rng.integers(-2, 3, (num, n))
-        middle = np.rint((low + high) / 2 / STEP) + rng.integers(-9, 10, (num, n))
-        m = np.where(self.some(0.5, n), rng.integers(-80, 81, (num, n)), 0).astype(float)
+        near = np.stack(borders, -1)[np.arange(n), rng.integers(0, 4, (*SHAPE, n))]
+        near = near + rng.integers(-2, 3, (*SHAPE, n))
+        middle = np.rint((low + high) / 2 / STEP) + rng.integers(-9, 10, (*SHAPE, n))
+        m = np.where(self.some(0.5, n), rng.integers(-80, 81, (*SHAPE, n)), 0).astype(float)
         m = self.put(m, 0.3, -80, 80)
-        m[:, self.machine.locked] = 0
-        heartbeat = -rng.uniform(0, 0.1, (num, n + 1))
+        m[..., self.machine.locked] = 0
+        heartbeat = -rng.uniform(0, 0.1, (*SHAPE, n + 1))
         return GateInputs(
             command=self.put(m, 0.01, np.nan, np.inf, -np.inf, 1e300, 81, -81, 80.5, 1, -1),
             counts=np.where(self.some(0.3, n), near, middle).astype(int),
-            frames=self.put(np.ones((num, n), int), 0.01, 0, 2, 3),
+            frames=self.put(np.ones((*SHAPE, n), int), 0.01, 0, 2, 3),
             heartbeat=self.put(heartbeat, 0.01, -0.110, -0.110 - 1e-9, -np.inf, 0.049, 1.0, np.nan),
-            nmt=self.put(np.full((num, n + 1), 5), 0.01, 0, 4, 6, 127),
+            nmt=self.put(np.full((*SHAPE, n + 1), 5), 0.01, 0, 4, 6, 127),
             enable=self.some(0.8),
             centred=self.some(0.7),
             alive=~self.some(0.03),
@@ -160,49 +159,49 @@ class Cases:
         )
 
     def draw_state(self):
-        rng, num, n = self.rng, self.num, self.machine.n
+        rng, n = self.rng, self.machine.n
         fastest = np.floor((2 * self.machine.q_dot_max * DT + 0.0045) / STEP + 1).astype(int)
-        jump = rng.choice([-1, 1], (num, n)) * (fastest + rng.integers(-1, 2, (num, n)))
-        step = np.where(self.some(0.5, n), 0, rng.integers(-3, 4, (num, n)))
+        jump = rng.choice([-1, 1], (*SHAPE, n)) * (fastest + rng.integers(-1, 2, (*SHAPE, n)))
+        step = np.where(self.some(0.5, n), 0, rng.integers(-3, 4, (*SHAPE, n)))
         last = self.inputs.counts - np.where(self.some(0.03, n), jump, step)
         # commands: to one side for some ticks, or not; now and then one to the other side
         odds = [0.01, 0.3, 0.19, 0.3, 0.2]
-        sides = rng.choice([-1, 1], (num, n, 1))
-        push = sides * rng.choice([12, 13, 14, 40, 80], (num, n, 9), p=odds)
-        pushed = np.arange(9, 0, -1) <= rng.choice([0, 7, 8, 9], (num, n, 1))
-        sent = np.where(pushed, push, rng.integers(-80, 81, (num, n, 9)))
+        sides = rng.choice([-1, 1], (*SHAPE, n, 1))
+        push = sides * rng.choice([12, 13, 14, 40, 80], (*SHAPE, n, 9), p=odds)
+        pushed = np.arange(9, 0, -1) <= rng.choice([0, 7, 8, 9], (*SHAPE, n, 1))
+        sent = np.where(pushed, push, rng.integers(-80, 81, (*SHAPE, n, 9)))
         late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, np.nan, -1.0)
         return GateState(
             driving=self.some(0.6),
             armed_once=self.some(0.5),
-            active_fault=rng.choice(["", "error"], num),
-            latched_fault=rng.choice(["", "q4: jumped"], num),
+            active_fault=rng.choice(["", "error"], SHAPE),
+            latched_fault=rng.choice(["", "q4: jumped"], SHAPE),
             enable=self.some(0.5),
-            time=-self.put(np.full(num, DT), 0.1, *late),
-            counter=rng.choice([0, 1, 127, 254, 255], num),
+            time=-self.put(np.full(SHAPE, DT), 0.1, *late),
+            counter=rng.choice([0, 1, 127, 254, 255], SHAPE),
             counts=last,
             sent=np.where(self.some(0.02, n, 9), -sent, sent),
-            place=self.inputs.counts + rng.integers(-2, 3, (num, n)),
-            motion=STEP * rng.choice([0.0, 1.5, 2.7, 3.2], (num, n), p=[0.7, 0.15, 0.1, 0.05]),
+            place=self.inputs.counts + rng.integers(-2, 3, (*SHAPE, n)),
+            motion=STEP * rng.choice([0.0, 1.5, 2.7, 3.2], (*SHAPE, n), p=[0.7, 0.15, 0.1, 0.05]),
         )
 
 
 @pytest.mark.parametrize(("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1)])
 def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
-    cases, shape = Cases(machine, 3000, seed), (3, 10, 100)
-    given = [
-        type(part)(*(np.reshape(field, (*shape, *np.shape(field)[1:])) for field in part))
-        for part in (cases.state, cases.inputs)
-    ]
-    state, frame = gate(machine, *given, np.zeros(shape))
-    assert frame.dtype == np.uint8 and frame.shape == (*shape, 8)
-    frame = frame.reshape(3000, 8)
-    np.testing.assert_array_equal(np.delete(frame, 6, axis=1), [f for _, f in cases.expected])
-    np.testing.assert_array_equal(frame[:, 6], checksum(np.delete(frame, 6, axis=1)))
+    cases = Cases(machine, seed)
+    state, frame = gate(machine, cases.state, cases.inputs, np.zeros(SHAPE))
+    results = []
+    for row in np.ndindex(SHAPE):
+        given = [type(part)(*(x[row] for x in part)) for part in (cases.state, cases.inputs)]
+        results.append(plain_gate(machine, *given, 0))
+    expected, frames = zip(*results, strict=True)
+    assert frame.dtype == np.uint8
+    np.testing.assert_array_equal(frame[..., 6], checksum(np.delete(frame, 6, axis=-1)))
+    sent = np.reshape(frames, (*SHAPE, 7))
+    np.testing.assert_array_equal(np.delete(frame, 6, axis=-1), sent)
     for name, found in zip(GateState._fields, state, strict=True):
-        expected = np.array([getattr(s, name) for s, _ in cases.expected])
-        assert np.shape(found) == (*shape, *expected.shape[1:]), name
-        np.testing.assert_array_equal(np.reshape(found, expected.shape), expected, name)
-    faults = {s.active_fault.split(": ")[-1] for s, _ in cases.expected}
+        wanted = np.array([getattr(one, name) for one in expected])
+        np.testing.assert_array_equal(found, wanted.reshape(*SHAPE, *wanted.shape[1:]), name)
+    faults = {one.active_fault.split(": ")[-1] for one in expected}
     assert len(faults) == 16, "each fault comes up"
-    assert sum(bool(s.driving and any(f[:5])) for s, f in cases.expected) > 300
+    assert (sent[..., :5].any(axis=-1) & state.driving).sum() > 300
