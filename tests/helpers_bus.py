@@ -16,7 +16,7 @@ import pytest
 from helpers_machines import obedient_net
 
 from brokk_min.actuator import AnalyticPlant
-from brokk_min.can.canopen import Frame, OperatorInput, valve_frame
+from brokk_min.can.canopen import Frame, OperatorInput
 from brokk_min.can.connection import Bus, open_bus
 from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.hw import Drive
@@ -162,31 +162,6 @@ class World:
         """Times [s] and commands in force in counts (T, n), by the plant's own record."""
         u = np.array(self.recorder.u)
         return 0.005 * np.arange(1, len(u) + 1), np.rint(u * 127).astype(int)
-
-
-class RemoteControl:
-    """The machine's own: SYNC each `period` [s], and valve frames with `command(tick)` after it.
-
-    Put it in the place of `World.noise`. Without `period` it sends no SYNC.
-    """
-
-    delay = 0.004  # s, of the valve frames
-
-    def __init__(self, world, command, period=0.05):
-        self.world, self.command, self.period = world, command, period
-        self.count = self.syncs = 0
-        world.simulated.receive(Frame(0.0, 0x000, b"\x01\x00"))
-
-    def __call__(self):
-        out = []
-        if self.period and self.world.time >= (self.syncs + 1) * self.period:
-            self.syncs += 1
-            out.append((0x080, b""))
-        if self.world.time >= (self.count + 1) * 0.05 + self.delay:
-            self.count += 1
-            data = valve_frame(self.command(self.count), self.count % 256, 1)
-            out.append((0x210, data.tobytes()))
-        return out
 
 
 class ConstantCommand:

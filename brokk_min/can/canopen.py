@@ -50,7 +50,7 @@ class Nodes:
         nodes = node_numbers(machine)
         self.machine = machine
         self.own_ids: tuple[int, ...] = (NMT, SYNC, machine.valve_frame_id)  # nobody else's
-        self.received = self.others = 0  # frames of this tick; of them in `own_ids`, not sent
+        self.received = self.others = 0  # frames of this tick, and those in `own_ids`
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}
         self.raw = np.full(machine.n, -1)  # -1: none yet
@@ -77,7 +77,7 @@ class Nodes:
     def update(self, frame: Frame) -> None:
         """Take in one frame; those of others change nothing."""
         self.received += 1
-        self.others += frame.id in self.own_ids and not frame.sent
+        self.others += frame.id in self.own_ids
         if frame.id in self.position_index:
             i = self.position_index[frame.id]
             raw = int.from_bytes(frame.data, "little")

@@ -42,6 +42,11 @@ class SimulatedMachine:
         self.waiting = False  # for a valve frame, since the last SYNC
         self._close_valves()
 
+    def _close_valves(self) -> None:
+        self.u: Array = np.zeros(self.machine.n)
+        self.enabled = False  # by a neutral frame with the enable byte, until the byte is cleared
+        self.counter: int | None = None  # of the last valve frame; after None any may come
+
     @property
     def next_step(self) -> float:
         """Time of the next plant step [s]."""
@@ -103,11 +108,6 @@ class SimulatedMachine:
             u, enable = canopen.read_valve_frame(self.machine, frame.data)
             self.enabled = enable and (self.enabled or not u.any())
             self.u = u * self.enabled
-
-    def _close_valves(self) -> None:
-        self.u: Array = np.zeros(self.machine.n)
-        self.enabled = False  # by a neutral frame with the enable byte, until the byte is cleared
-        self.counter: int | None = None  # of the last valve frame; after None any may come
 
     def _trip(self, reason: str) -> None:
         if self.nmt[self.controller] == OPERATIONAL:

@@ -6,20 +6,11 @@ from functools import partial
 import can
 import numpy as np
 import pytest
-from helpers_bus import (
-    START,
-    ConstantCommand,
-    HoldingOperator,
-    RemoteControl,
-    World,
-    only,
-    recording,
-    unchanged,
-)
+from helpers_bus import START, ConstantCommand, HoldingOperator, World, only, recording, unchanged
 from helpers_cli import run
 
 from brokk_min._files import SHIPPED
-from brokk_min.can.canopen import valve_frame
+from brokk_min.can.canopen import Frame, valve_frame
 from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.can.shadow import Shadow
 from brokk_min.cli.operating import status
@@ -28,6 +19,31 @@ from brokk_min.machine import BROKK_170
 
 POLICY = load_policy(SHIPPED / BROKK_170.name / POLICIES["rl"], BROKK_170)
 Q4 = 3
+
+
+class RemoteControl:
+    """The machine's own: SYNC each `period` [s], and valve frames with `command(tick)` after it.
+
+    Put it in the place of `World.noise`. Without `period` it sends no SYNC.
+    """
+
+    delay = 0.004  # s, of the valve frames
+
+    def __init__(self, world, command, period=0.05):
+        self.world, self.command, self.period = world, command, period
+        self.count = self.syncs = 0
+        world.simulated.receive(Frame(0.0, 0x000, b"\x01\x00"))
+
+    def __call__(self):
+        out = []
+        if self.period and self.world.time >= (self.syncs + 1) * self.period:
+            self.syncs += 1
+            out.append((0x080, b""))
+        if self.world.time >= (self.count + 1) * 0.05 + self.delay:
+            self.count += 1
+            data = valve_frame(self.command(self.count), self.count % 256, 1)
+            out.append((0x210, data.tobytes()))
+        return out
 
 
 def to_and_fro(joint, tick):
