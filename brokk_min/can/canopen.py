@@ -11,9 +11,10 @@ from brokk_min.machine import PWM_MAX, Machine, decode_pwm, encode_pwm, require
 
 Array = NDArray[Any]  # counts and flags, too
 
-# CAN identifiers of CANopen; from TPDO1 on the node's number, 1 to 127, is added
+# CAN identifiers of CANopen; from TPDO1 on the node's number is added
 NMT = 0x000
 SYNC = 0x080
+EMERGENCY = 0x080  # with the node's number
 TPDO1 = 0x180
 SDO_ANSWER = 0x580
 SDO_REQUEST = 0x600
@@ -98,9 +99,11 @@ class Nodes:
 def check_bus(machine: Machine) -> None:
     """ValueError: too many joints, an identifier twice, slow ticks, or joints beyond a turn."""
     require(machine.n <= MOST_JOINTS, "joints", f"at most {MOST_JOINTS} on a bus", machine.n)
-    valves = machine.valve_frame_id
-    fits = TPDO1 < valves < SDO_ANSWER and valves - TPDO1 not in node_numbers(machine)
-    require(fits, "valve_frame_id", "0x181 to 0x57F, of no encoder", f"0x{valves:03X}")
+    nodes, valves = node_numbers(machine), machine.valve_frame_id
+    bases = (EMERGENCY, TPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
+    others = {NMT, SYNC, *(base + node for base in bases for node in nodes)}
+    free = valves < WOULD_SEND and valves not in others
+    require(free, "valve_frame_id", "an identifier of no other frame", f"0x{valves:03X}")
     for joint in machine.joints:
         require(joint.kind == "revolute", f"{joint.name}.kind", "revolute on a bus", joint.kind)
         width = joint.q_max - joint.q_min  # less than a turn
@@ -128,8 +131,9 @@ def set_up_nodes(bus: Any, machine: Machine) -> None:
             what = f"{joint.name}: object 0x{index:04X}:{sub:02X}"
             require(found == value, what, meaning, f"{found} (0x{found:X})")
     bus.send(NMT, PRE_OPERATIONAL_ALL)
+    period = struct.pack("<H", round(1e3 * HEARTBEAT_PERIOD))  # ms
     for joint in machine.joints:
-        sdo(bus, joint.encoder_node, (0x1017, 0), struct.pack("<H", round(1e3 * HEARTBEAT_PERIOD)))
+        sdo(bus, joint.encoder_node, (0x1017, 0), period)  # of heartbeats
         sdo(bus, joint.encoder_node, (0x1800, 2), b"\x01")  # a position after every SYNC
     bus.send(NMT, START_ALL)
 
