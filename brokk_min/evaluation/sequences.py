@@ -4,9 +4,9 @@ Tuning never sees what is scored: only `task_sequences` has the seed of the scor
 `tuning_set` draws starts and goals by other seeds than `draw_starts`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,10 +25,6 @@ REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
 DRAWS, POSES = 50, 400  # so often so many poses are drawn, to find feasible ones (assumed)
-MARGINS = (  # of `feasible`, all assumed
-    "the tool within 20 mm of its path, the arm 0.1 m above the ground, driven joints 0.05 from "
-    "their ends and below 0.9 of their speeds"
-)
 TUNING = TaskConfig(zero_goals=0.3, hold_min_s=0.5, hold_max_s=3.0)  # assumed
 # Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
@@ -50,8 +46,8 @@ class Commands(NamedTuple):
     def for_starts(self, machine: Machine, starts: Array) -> Array:
         """Goals [m/s] (T, num, 3) from the starts [rad] (num, n).
 
-        Inward ones have x, y reversed where the tool starts at positive x, y, because the first
-        moves along +x and +y would fit into the arm's reach from one side of the slew range only.
+        Inward ones have x, y reversed where the tool starts at positive x, y, because otherwise
+        the arm could follow them from one side of the slew range only.
         """
         goals = np.repeat(self.goals[:, None], len(starts), axis=1)
         sign = np.where(tool_position(forward_kinematics(machine, starts)) > 0, -1.0, 1.0)
@@ -67,8 +63,7 @@ def axis_sequences(machine: Machine) -> list[Commands]:
 def task_sequences(machine: Machine) -> list[Commands]:
     """All sequences of the evaluation: the paper's three axes and six of ours. Paper: Sec. 4.2
 
-    Two diagonals; a circle (x-z) and a rectangle (y-z) at half the tool speed; stop and go along
-    x; slow motion near the dead zone along x and z. All begin and end at rest and last `SECONDS`.
+    The circle lies in the x-z plane. All begin and end at rest and last `SECONDS`.
     """
     angle = np.linspace(0, 2 * np.pi, round(16 * machine.rate), endpoint=False)
     circle = [(machine.dt, 0.5 * np.cos(x), 0, 0.5 * np.sin(x)) for x in angle]
@@ -93,12 +88,12 @@ def task_sequences(machine: Machine) -> list[Commands]:
 
 def along(direction: ArrayLike) -> Array:
     """Rows of the pattern `AXIS` along a unit vector (3,)."""
-    return np.array([(t, *(v * np.asarray(direction, float))) for t, v in AXIS])
+    seconds, speed = np.transpose(AXIS)
+    return np.column_stack([seconds, np.outer(speed, direction)])
 
 
 def _with_rests(rows: Array, rng: np.random.Generator) -> Array:
     """Rows with random seconds of each rest, such that all rows last `SECONDS`."""
-    rows = rows.astype(float)
     at_rest = ~rows[:, 1:].any(axis=1)
     total = SECONDS - rows[~at_rest, 0].sum()
     while True:
@@ -151,15 +146,10 @@ def read_starts(path: Path, machine: Machine) -> Array:
     return starts
 
 
-def evaluation_starts(
-    machine: Machine, num: int, sequences: Sequence[Commands], seed: int
-) -> Array:
-    """Start poses [rad] (num, n): of the Brokk 170 the first of the package's file.
-
-    For other machines they are drawn. ValueError: more starts than the file has.
-    """
+def evaluation_starts(machine: Machine, num: int, commands: Sequence[Commands], seed: int) -> Array:
+    """Start poses [rad] (num, n): those of the package's file, for other machines drawn ones."""
     if machine != BROKK_170:
-        return draw_starts(machine, num, sequences, seed)
+        return draw_starts(machine, num, commands, seed)
     path = SHIPPED / machine.name / "starts.csv"
     starts = read_starts(path, machine)
     require(num <= len(starts), path.name, f"at most {len(starts)} starts", num)
@@ -173,22 +163,21 @@ def draw_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed:
     """
     rng = np.random.default_rng(seed)
 
-    def draw() -> tuple[Array]:
+    def draw() -> Array:
         poses = draw_pose(machine, rng, POSES).round(4)
         poses = np.clip(poses, machine.column("q_min"), machine.column("q_max"))
         for sequence in sequences:
             poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
-        return (poses,)
+        return poses
 
-    return collected(machine, num, draw)[0]
+    return np.array(collected(machine, num, draw))
 
 
 def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     """Can ideal actuators follow `goals` [m/s] (T, num, 3) from `start` [rad] (num, n)? (num,).
 
     They answer at once, and are as fast as the analytic plant's cylinders at the command limit.
-    Integrates resolved velocities with little damping, and asks for `MARGINS` at each tick. The
-    tool stays on its path where no singularity is crossed.
+    The margins to the path, the ground, the joints' ranges and their speeds are assumed.
     """
     q, q_dot = np.array(start, float), np.zeros((len(start), machine.n))
     p_goal = tool_position(forward_kinematics(machine, q))
@@ -221,29 +210,29 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
     scored ones. ValueError: too few.
     """
     rng = np.random.default_rng(seed + 1000)
-    shape = POSES, int(np.ceil(seconds / TUNING.hold_min_s))  # poses, and goals of each: enough
+    shape = POSES, int(np.ceil(seconds / TUNING.hold_min_s))  # of goals: enough for each pose
 
-    def draw() -> tuple[Array, Array]:
+    def draw() -> Iterable[tuple[Array, Array]]:
         poses = draw_pose(machine, rng, POSES)
         v_goal = draw_goal(machine, TUNING, rng, shape[0] * shape[1]).reshape(*shape, 3)
         rests = np.rint(_log_uniform(rng, shape) * machine.rate).astype(int)
         holds = draw_hold(machine, TUNING, rng, shape[0] * shape[1]).reshape(shape)
         ticks = np.where(v_goal.any(axis=-1), holds, rests)
-        drawn = [np.repeat(*of, axis=0) for of in zip(v_goal, ticks, strict=True)]
-        goals = np.stack([run[: round(seconds * machine.rate)] for run in drawn], axis=1)
-        follows = feasible(machine, poses, goals)
-        return poses[follows], goals.swapaxes(0, 1)[follows]
+        runs = [np.repeat(*run, axis=0) for run in zip(v_goal, ticks, strict=True)]
+        goals = np.stack([run[: round(seconds * machine.rate)] for run in runs])
+        follows = feasible(machine, poses, goals.swapaxes(0, 1))
+        return zip(poses[follows], goals[follows], strict=True)
 
-    starts, goals = collected(machine, num, draw)
-    return starts, goals.swapaxes(0, 1)
+    starts, goals = zip(*collected(machine, num, draw), strict=True)
+    return np.array(starts), np.stack(goals, axis=1)
 
 
-def collected(machine: Machine, num: int, draw: Callable[[], tuple[Array, ...]]) -> list[Array]:
-    """The first `num` rows of arrays that are drawn again and again; ValueError: too few."""
-    drawn: list[tuple[Array, ...]] = []
+def collected(machine: Machine, num: int, draw: Callable[[], Iterable[Any]]) -> list[Any]:
+    """The first `num` of what is drawn again and again; ValueError: too few."""
+    found: list[Any] = []
     for _ in tqdm(range(DRAWS), "draw starts", leave=False, disable=None):
-        drawn.append(draw())
-        found = sum(len(rows[0]) for rows in drawn)
-        if found >= num:
-            return [np.concatenate(of)[:num] for of in zip(*drawn, strict=True)]
-    raise ValueError(f"{machine.name}: expected {num} starts with {MARGINS}, got {found}")
+        found.extend(draw())
+        if len(found) >= num:
+            return found[:num]
+    wanted = "from which the arm stays on its path, above the ground and within ranges and speeds"
+    raise ValueError(f"{machine.name}: expected {num} starts {wanted}, got {len(found)}")

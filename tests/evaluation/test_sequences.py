@@ -143,7 +143,7 @@ def test_evaluation_starts__are_drawn_by_the_seed_for_another_machine():
 def test_draw_starts__refuses_a_machine_that_can_follow_nothing(monkeypatch):
     monkeypatch.setattr(s, "draw_pose", lambda *_: np.tile(START, (3, 1)))  # faster
     sequences = [s.Commands("fast", np.full((2, 3), 9.0))]
-    message = "^brokk170: expected 2 starts with the tool within 20 mm of its path, .*, got 0$"
+    message = "^brokk170: expected 2 starts from which the arm stays on its path, .*, got 0$"
     with pytest.raises(ValueError, match=message):
         s.draw_starts(BROKK_170, 2, sequences, 0)
 
