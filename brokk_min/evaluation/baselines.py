@@ -24,7 +24,8 @@ OPTIMISED = "jacobian_pid_k0.1"
 PAPER_BASELINES = (OPTIMISED, "jacobian_pid_k0.05")
 STRONGEST = "jacobian_pid_ff_integral"
 TUNED = {OPTIMISED: 1, STRONGEST: 2}  # by `tune`, with so many times the generations below
-EFFORT = (40, 30, 20.0)  # of tuning, assumed: generations, runs of a candidate, their length [s]
+Effort = tuple[int, int, float]  # of tuning: generations, runs of a candidate, their length [s]
+EFFORT: Effort = (40, 30, 20.0)  # assumed
 CANDIDATES = 24  # of each generation
 SPREAD = 0.12  # of the first candidates, as a fraction of the roots of the ranges, assumed
 OVERSHOOT = 0.2  # of a step of velocity, that tuning by hand allows
@@ -45,9 +46,8 @@ def baselines(
 ) -> dict[str, JacobianController]:
     """PIDs with the paper's structure, and the strongest, by default with `first_gains`.
 
-    The raw one does not compensate the dead zone, of which the paper says nothing. Those with
-    the paper's two k have the same gains, because damping acts near singularities alone.
-    Paper: Sec. 4.2
+    The raw one does not compensate the dead zone. Both with the paper's two k have the same gains,
+    because damping acts near singularities alone. Paper: Sec. 4.2
     """
     w0 = manipulability_threshold(machine)
     gains = gains or first_gains(machine)
@@ -95,52 +95,48 @@ class JointStep(JacobianController):
 def gains_by_hand(machine: Machine, known: Machine, plant: Plant = PLANT) -> Gains:
     """Gains by one rule of thumb, joint by joint, from step trials on the plant.
 
-    A step goes from rest amid all ranges to a third of the joint's fastest motion up, or down, for
-    2 s, and back to rest. P is raised until a velocity overshoots by 20 %, and halved; then I is
-    raised as long as none overshoots by more. There is no D. `known` is what the controller takes
-    for the machine.
+    P is raised until a velocity overshoots by more than `OVERSHOOT`, and halved; then I is raised
+    as long as none does. There is no D. `known` is what the controller takes for the machine.
     """
-    trial = partial(overshoots, machine, known, plant)
-    n = len(machine.driven)
-    tried = np.tile(np.geomspace(0.05, 50, 70)[:, None], n)  # 10 % apart
-    kp = largest(tried, trial(tried, 0 * tried)) / 2
-    ki = largest(tried, trial(0 * tried + kp, tried))
+    tried = np.geomspace(0.05, 50, 70)  # 10 % apart
+    kp, ki = np.zeros((2, len(machine.driven)))
+    for i in range(len(kp)):
+        trial = partial(overshoots, machine, known, plant, i)
+        kp[i] = tried[last_below(trial(tried, 0 * tried))] / 2
+        ki[i] = tried[last_below(trial(0 * tried + kp[i], tried))]
     return Gains(kp, ki, 0 * kp, np.full(1, 0.4))
 
 
-def largest(gains: Array, over: Array) -> Array:
-    """Of rising gains (rows, n) the last before one overshoots by more than allowed, (n,)."""
-    fits = np.cumsum(over > OVERSHOOT, axis=0) == 0
-    return np.asarray(np.max(np.where(fits, gains, gains[0]), axis=0))
+def last_below(over: Array) -> int:
+    """The row before the first that overshoots by more than `OVERSHOOT`, or the last, or 0."""
+    return max(int(np.argmax(np.append(over, np.inf) > OVERSHOOT)) - 1, 0)
 
 
-def overshoots(machine: Machine, known: Machine, plant: Plant, kp: Array, ki: Array) -> Array:
-    """Overshoot of a step of each joint alone, as a fraction of it, by gains (rows, n_driven)."""
-    driven, rows = machine.driven, len(kp)
-    one = np.eye(len(driven))[:, None]  # the joint that moves
-    fastest = np.stack([machine.column("q_dot_up"), -machine.column("q_dot_down")])[:, driven]
-    goal = fastest[..., None, None] / 3 * np.broadcast_to(one, (len(driven), rows, len(driven)))
-    num = goal[..., 0].size
-    p, i, d = (np.broadcast_to(x * one, goal.shape).reshape(num, -1) for x in (kp, ki, 0 * kp))
-    gains = Gains(p, i, d, np.zeros((num, 1)))
-    step = JointStep(known, gains, 0.0, 1.0, goal.reshape(num, -1))
-    middle = np.tile((machine.column("q_min") + machine.column("q_max")) / 2, (num, 1))
+def overshoots(
+    machine: Machine, known: Machine, plant: Plant, index: int, kp: Array, ki: Array
+) -> Array:
+    """Overshoot of steps of one driven joint, as a fraction of them, by gains (rows,): (rows,).
+
+    A step goes from rest amid all ranges to a third of the joint's fastest motion up, or down, for
+    2 s, and back to rest. The larger overshoot of both counts.
+    """
+    joint, alone = machine.driven[index], np.eye(len(machine.driven))[index]
+    fastest = machine.column("q_dot_up")[joint], -machine.column("q_dot_down")[joint]
+    goal = np.repeat(fastest, len(kp)) / 3  # (2 rows,)
+    p, i = (np.outer(np.tile(gain, 2), alone) for gain in (kp, ki))
+    gains = Gains(p, i, 0 * p, np.zeros((len(p), 1)))
+    step = JointStep(known, gains, 0.0, 1.0, np.outer(goal, alone))
+    middle = np.tile((machine.column("q_min") + machine.column("q_max")) / 2, (len(p), 1))
     ticks = round(2 * machine.rate)
-    goals = np.repeat([1.0, 0.0], ticks)[:, None, None] * np.ones((num, 3))  # move, stand
+    goals = np.repeat([1.0, 0.0], ticks)[:, None, None] * np.ones((len(p), 3))  # move, stand
     trace = rollout(machine, step, middle, goals, 0.0, np.random.default_rng(0), plant)
-    moved = trace.q_dot[..., driven].reshape(-1, *goal.shape)
-    velocity = np.einsum("tdjrj->tdrj", moved) / (fastest[:, None] / 3)
+    velocity = trace.q_dot[..., joint] / goal
     over = np.maximum(velocity.max(axis=0) - 1, -velocity[ticks:].min(axis=0))
-    return np.asarray(over.max(axis=0))
-
-
-def gains_vector(gains: Gains) -> Array:
-    """Gains as one vector (..., size), in the order of their fields."""
-    return np.concatenate(list(vars(gains).values()), axis=-1)
+    return np.asarray(over.reshape(2, -1).max(axis=0))
 
 
 def gains_of(like: Gains, vector: Array) -> Any:
-    """Gains of the kind of `like` from a vector (..., size): the inverse of `gains_vector`."""
+    """Gains of the kind of `like` from a vector (..., size) of all of them in their order."""
     sizes = [array.shape[-1] for array in vars(like).values()]
     return type(like)(*np.split(vector, np.cumsum(sizes)[:-1], axis=-1))
 
@@ -156,29 +152,27 @@ def tuning_cost(
 
     `runs` are starts [rad] (num, n) and goals [m/s] (T, num, 3) of `tuning_set`.
     """
-    start, goals = runs
-    rows, num = len(vectors), len(start)
-    every = gains_of(controller.gains, np.repeat(vectors, num, axis=0))
-    start, goals = np.tile(start, (rows, 1)), np.tile(goals, (1, rows, 1))
+    rows, num = len(vectors), len(runs[0])
+    batch = replace(controller, gains=gains_of(controller.gains, np.repeat(vectors, num, axis=0)))
+    start, goals = np.tile(runs[0], (rows, 1)), np.tile(runs[1], (1, rows, 1))
     rng = np.random.default_rng(seed)
-    batch = replace(controller, gains=every)
     trace = rollout(controller.machine, batch, start, goals, TaskConfig.noise, rng, plant)
     error = np.linalg.norm(goals - trace.v_tool, axis=-1)  # (T, rows * num)
     return np.asarray(error.mean(axis=0).reshape(rows, num).mean(axis=1))
 
 
 def tune(gains: Gains, cost: Callable[[Array], Array], seed: int, generations: int) -> Array:
-    """The vector of gains of least cost.
+    """The vector of gains of least `cost`, which is that (rows,) of rows of gains.
 
-    SciPy's differential evolution over fractions x of the roots of the ranges, so that small gains
-    of a wide range are searched as finely as large ones: gain = low + x^2 (high - low). The first
-    candidates are near `gains`. `cost` is that (rows,) of rows of gains.
+    SciPy's differential evolution over x in gain = low + x^2 (high - low), so that small gains of a
+    wide range are searched as finely as large ones. The first candidates are near `gains`.
     """
     from scipy.optimize import Bounds, differential_evolution  # slow to import
 
     sizes = [array.shape[-1] for array in vars(gains).values()]
     low, high = np.repeat([RANGES[name] for name in vars(gains)], sizes, axis=0).T
-    start = np.sqrt(np.clip((gains_vector(gains) - low) / (high - low), 0, 1))
+    vector = np.concatenate(list(vars(gains).values()))
+    start = np.sqrt(np.clip((vector - low) / (high - low), 0, 1))
     rng = np.random.default_rng(seed)
     first = np.clip(rng.normal(start, SPREAD, (CANDIDATES, len(start))), 0, 1)
     first[0] = start
@@ -197,16 +191,11 @@ def tune(gains: Gains, cost: Callable[[Array], Array], seed: int, generations: i
 
 
 def tuned_baselines(
-    machine: Machine,
-    net: ActuatorNet,
-    effort: tuple[int, int, float],
-    seed: int,
-    plant: Plant = PLANT,
+    machine: Machine, net: ActuatorNet, effort: Effort, seed: int, plant: Plant = PLANT
 ) -> dict[str, JacobianController]:
-    """The `baselines` with gains by hand, and with tuned ones; for `effort` see `EFFORT`.
+    """The `baselines` with gains by hand, and with tuned ones.
 
-    The runs are on the `plant` itself, which favours the baselines, because the policy is trained
-    on nets alone.
+    The runs are on the `plant` itself, which favours the baselines: policies see nets alone.
     """
     generations, num, seconds = effort
     runs = tuning_set(machine, num, seed, seconds)

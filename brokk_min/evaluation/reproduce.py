@@ -31,7 +31,7 @@ class Budget:
     hours: float = 1.0  # driving time of each actuator that is recorded (paper: 1 h)
     fit_steps: int = fitting.FitConfig.steps
     train_steps: int | None = None  # None: as many as the recipe has
-    tuning: tuple[int, int, float] = baselines.EFFORT
+    tuning: baselines.Effort = baselines.EFFORT
     starts: int = 32
     short_s: float = 26.0  # s, longest run for robustness
 
@@ -52,8 +52,7 @@ class Chain:
 def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[str, Any]:
     """Run the chain; logs, nets, policies, gains, starts, results and `report.html` go to `out`.
 
-    `table.json` has the means along x, y and z alone. No file of results has times, so the same
-    seed gives the same files on the same computer.
+    `table.json` has the means along x, y and z alone. The same seed gives the same files again.
     """
     chain = Chain(machine, out, budget, seed)
     out.mkdir(parents=True, exist_ok=True)
@@ -95,10 +94,7 @@ def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
 
 
 def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
-    """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names.
-
-    The policy as printed learns on nets as printed, the others on ours.
-    """
+    """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names."""
     jobs: dict[str, Callable[..., Any]] = {
         "net": partial(fit_net, chain, "net", log, {}),
         "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
@@ -106,7 +102,7 @@ def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
     needs = {"pids": ["net"]}
     for name in sorted(POLICIES, reverse=True):  # the longest first
         jobs[name] = partial(train, chain, name)
-        needs[name] = ["net_paper" if name == "rl_critic" else "net"]
+        needs[name] = ["net_paper" if name == "rl_critic" else "net"]  # as printed on as printed
     tuned = partial(baselines.tuned_baselines, chain.machine)
     jobs["pids"] = partial(tuned, effort=chain.budget.tuning, seed=chain.seed)
     return side_by_side(jobs, needs)

@@ -31,11 +31,12 @@ def test_baselines__have_the_papers_structure_but_for_the_strongest():
 def test_first_gains__by_hand_are_those_of_the_rule():
     """P overshoots by 20 % at twice the gain and 10 % more; so does the next larger I."""
     gains = baselines.first_gains(BROKK_170)
-    p, i = gains["pid_by_hand"].kp, gains["pid_by_hand"].ki
-    rows = np.array([[2 * p, 0 * i], [p, i], [2.22 * p, 0 * i], [p, 1.11 * i]]).swapaxes(0, 1)
-    over = baselines.overshoots(BROKK_170, BROKK_170, PLANT, *rows)
-    assert (over[:2] <= 0.2).all() and (over[2:] > 0.2).all()
-    assert not gains["pid_by_hand"].kd.any() and (gains["pid_by_hand_raw"].kp > p).all()
+    hand = gains["pid_by_hand"]
+    for i, (p, k) in enumerate(zip(hand.kp, hand.ki, strict=True)):
+        rows = np.array([[2 * p, 0], [p, k], [2.22 * p, 0], [p, 1.11 * k]]).T
+        over = baselines.overshoots(BROKK_170, BROKK_170, PLANT, i, *rows)
+        assert (over[:2] <= 0.2).all() and (over[2:] > 0.2).all()
+    assert not hand.kd.any() and (gains["pid_by_hand_raw"].kp > hand.kp).all()
 
 
 def test_tune__finds_the_minimum_of_a_bowl_and_repeats_itself():
@@ -61,7 +62,7 @@ def test_tuning_cost__is_the_mean_error_of_each_row_of_gains():
     start = np.array([[0.0, 0.5, 0.58, 1.71, 1.24], [1.0, 0.5, 0.58, 1.71, 1.24]])
     goals = np.tile([0.0, 0.1, 0.0], (8, 2, 1))  # 0.4 s
     goals[:, 1] *= 2
-    vectors = np.outer([0, 1], baselines.gains_vector(controller.gains))
+    vectors = np.outer([0, 1], np.concatenate(list(vars(controller.gains).values())))
     of_plant = baselines.tuning_cost(controller, (start, goals), 0, PLANT, vectors)
     of_nets = baselines.tuning_cost(controller, (start, goals), 0, NET, vectors)
     assert of_plant[0] == pytest.approx(0.15) and 0.1 < of_plant[1] < 0.15
@@ -74,9 +75,8 @@ def test_write_gains__reads_back(tmp_path):
     baselines.write_gains(tmp_path / "gains.json", other, meta)
     read = baselines.read_gains(tmp_path / "gains.json", BROKK_170, NET)
     assert list(read) == NAMES
-    for name, of in read.items():
-        vectors = (baselines.gains_vector(c.gains) for c in (of, other[name]))
-        np.testing.assert_array_equal(*vectors)
+    for name, pid in read.items():
+        np.testing.assert_equal(vars(pid.gains), vars(other[name].gains))
 
 
 @pytest.mark.parametrize(
