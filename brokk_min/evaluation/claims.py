@@ -5,7 +5,7 @@ Paper: Sec. 3.2, 4.1, 4.2, 5
 """
 
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -29,27 +29,21 @@ SHORT = {ERROR: "error", DRIFT: "drift"}  # in columns
 def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any]:
     """A sentence of `claims.toml` with its verdicts, as in `results.json`.
 
-    `numbers` are by what is judged and by what they are of.
+    `numbers` are by what is judged and by what they are of. The sentence holds where all of them,
+    with their intervals, are beyond its limit.
     """
     text = TEXTS[name]
-    side = "above" if "above" in text else "below"
-    return {
-        "figure": text["figure"],
-        "paper": text["paper"],
-        "measured": f"{text['measure']}, to be {side} {text[side]:g}",
-        "numbers": numbers,
-        "verdicts": {judged: verdict(text, row.values()) for judged, row in numbers.items()},
-    }
-
-
-def verdict(text: Mapping[str, Any], numbers: Iterable[Mean]) -> str:
-    """A sentence holds where all numbers, with their intervals, are beyond its limit."""
-    ends = [number["low" if "above" in text else "high"] for number in numbers]
-    known = [end for end in ends if end is not None]
-    if len(known) < len(ends):
-        return "was not measured"
-    beyond = min(known) > text["above"] if "above" in text else max(known) < text["below"]
-    return "holds here" if beyond else "does not hold here"
+    side, end = ("above", "low") if "above" in text else ("below", "high")
+    verdicts = {}
+    for judged, row in numbers.items():
+        ends = np.array([number[end] for number in row.values()], float)  # nan: no interval
+        beyond = ends > text[side] if side == "above" else ends < text[side]
+        verdicts[judged] = "holds here" if beyond.all() else "does not hold here"
+        if np.isnan(ends).any():
+            verdicts[judged] = "was not measured"
+    measured = f"{text['measure']}, to be {side} {text[side]:g}"
+    known = {"figure": text["figure"], "paper": text["paper"], "measured": measured}
+    return known | {"numbers": numbers, "verdicts": verdicts}
 
 
 def net_claims(nets: SimulatorTests, gap: Motion) -> list[dict[str, Any]]:

@@ -84,8 +84,7 @@ def evaluate(
 
     `starts` are angles [rad] (starts, n). The sensors have the noise of training. Returns one row
     per controller, sequence and start, see `metrics`; and traces. The kind of the starts is
-    "workspace", because the machine's own sequences are feasible from them; the command `evaluate`
-    calls those of a user's file "file".
+    "workspace", because the machine's own sequences are feasible from them.
     """
     p_start = tool_position(forward_kinematics(machine, starts))
     goals = {s.name: s.for_starts(machine, starts) for s in sequences}  # all are one batch

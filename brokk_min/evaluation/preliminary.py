@@ -58,56 +58,47 @@ def simulate(machine: Machine, plant: Plant, q: Array, u: Array) -> Array:
 
 
 def preliminary_tests(machine: Machine, plant: Plant) -> SimulatorTests:
-    """Range and direction, coupling, past movement. Paper: Sec. 3.2, Fig. 2"""
-    joint = int(machine.driven[-1])
+    """Range and direction, coupling, past movement. Paper: Sec. 3.2, Fig. 2
+
+    The last driven joint goes from stop to stop, while the others begin amid their ranges.
+    """
+    joint, others = machine.driven[-1], machine.driven[:-1]
     limit = machine.pwm_limit / PWM_MAX
     slow = round(SLOW * machine.pwm_limit) / PWM_MAX
     u = np.zeros((5, machine.n))
     u[:, joint] = [slow, limit, -limit, -slow, limit]
-    others = machine.driven[:-1]  # the last of them up, all others down, as in the paper
     u[4, others] = -limit
-    u[4, others[-1:]] = limit
-    *alone, together = sweeps(machine, plant, joint, u)
-    names = [f"u = {encode_pwm(level)}" for level in u[:4, joint]]
-    steps = step_velocities(machine, plant, joint)
-    time = (np.arange(len(steps)) + 0.5 - len(steps) // 2) * machine.dt
-    return SimulatorTests(
-        dict(zip(names, alone, strict=True)),
-        {"alone": alone[1], "with the others": together},
-        {"idle": (time, steps[:, 0]), "moving": (time, steps[:, 1])},
-    )
-
-
-def sweeps(machine: Machine, plant: Plant, joint: int, u: Array) -> list[tuple[Array, Array]]:
-    """Angle and velocity of a joint from stop to stop under each row of constant commands `u`.
-
-    The others begin amid their ranges. A sweep ends when the joint stands. Paper: Sec. 3.2
-    """
+    u[4, others[-1:]] = limit  # the last of them up, all others down, as in the paper
     low, high = machine.column("q_min"), machine.column("q_max")
-    q = np.tile((low + high) / 2, (len(u), 1))
+    q = np.tile((low + high) / 2, (5, 1))
     q[:, joint] = np.where(u[:, joint] > 0, low[joint], high[joint])
     ticks = round(SWEEP_S * machine.rate)
     angles = simulate(machine, plant, q, np.tile(u, (ticks, 1, 1)))[..., joint]
     velocities = np.diff(angles, axis=0) * machine.rate
-    ends = [1 + np.max(np.flatnonzero(q_dot), initial=0) for q_dot in velocities.T]
-    return [(angles[1 : end + 1, i], velocities[:end, i]) for i, end in enumerate(ends)]
+    ends = [1 + np.max(np.flatnonzero(q_dot), initial=0) for q_dot in velocities.T]  # it stands
+    *alone, together = [(angles[1 : end + 1, i], velocities[:end, i]) for i, end in enumerate(ends)]
+    names = [f"u = {encode_pwm(level)}" for level in u[:4, joint]]
+    coupling = {"alone": alone[1], "with the others": together}
+    return SimulatorTests(dict(zip(names, alone, strict=True)), coupling, steps(machine, plant))
 
 
-def step_velocities(machine: Machine, plant: Plant, joint: int) -> Array:
-    """Velocities [rad/s] (T, 2) of a joint around a step up to the limit after T / 2 ticks.
+def steps(machine: Machine, plant: Plant) -> Curves:
+    """Velocity over time around a step up to the limit: from idle, and at half its opening.
 
-    Columns: from idle, and out of a motion at half the limit's opening. They are means over a
-    tick. The joint begins at a tenth of its range. Paper: Sec. 3.2 (past movement)
+    The last driven joint begins at a tenth of its range. Paper: Sec. 3.2 (past movement)
     """
+    joint = machine.driven[-1]
     low, high = machine.column("q_min"), machine.column("q_max")
-    wait = max(round(1.5 * machine.rate), 2 * machine.history)
+    wait = max(round(1.5 * machine.rate), 2 * machine.history)  # ticks before and after the step
     q = np.tile((low + high) / 2, (2, 1))
     q[:, joint] = 0.9 * low[joint] + 0.1 * high[joint]
     limit = machine.pwm_limit / PWM_MAX
     u = np.zeros((2 * wait, *q.shape))
     u[:wait, 1, joint] = (limit + machine.dead_zones[joint, 0]) / 2
     u[wait:, :, joint] = limit
-    return np.diff(simulate(machine, plant, q, u)[..., joint], axis=0) * machine.rate
+    velocities = np.diff(simulate(machine, plant, q, u)[..., joint], axis=0) * machine.rate
+    time = (np.arange(2 * wait) + 0.5 - wait) * machine.dt  # the middles of the ticks
+    return {"idle": (time, velocities[:, 0]), "moving": (time, velocities[:, 1])}
 
 
 def response_time(time: Array, velocity: Array) -> float | None:

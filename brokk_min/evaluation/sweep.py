@@ -32,9 +32,8 @@ def sweep(
 ) -> dict[str, dict[str, Mean]]:
     """Train and evaluate `seeds`; means over seeds with intervals, by sequence and figure.
 
-    They and all runs go to `sweep.json`. A seed counts once, with its mean over the starts. `out`
-    is the folder of all files, `starts` the number of start poses, `scheduler` the address of a
-    dask scheduler (None: this machine).
+    They and all runs go to `sweep.json` in `out`. A seed counts once, with its mean over `starts`
+    poses. `scheduler` is the address of a dask scheduler (None: this machine).
     """
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
