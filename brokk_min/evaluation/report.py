@@ -1,31 +1,39 @@
-"""The report: one HTML page with the paper's figures. The page itself is in `report.html.j2`."""
+"""The report: the paper's figures, and one HTML page with them, `report.html.j2`.
+
+Controllers differ in colour and in dashes, so that the colour-blind tell them apart, too.
+"""
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jinja2 import StrictUndefined, Template
 from matplotlib import style
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.linalg import norm
 from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, read_json, whole_file
-from brokk_min.evaluation import figures
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST
 from brokk_min.evaluation.metrics import COLUMNS, Traces, interval_text
-from brokk_min.evaluation.preliminary import Motion, SimulatorTests
+from brokk_min.evaluation.preliminary import Curves, Motion, SimulatorTests
 from brokk_min.evaluation.rollout import TITLES, valves_at_rest
-from brokk_min.evaluation.sequences import axis_sequences
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.evaluation.sequences import AXES, Commands, axis_sequences
+from brokk_min.kinematics import forward_kinematics, tool_position
+from brokk_min.machine import BROKK_170, Array, Machine
 
 Results = Mapping[str, Any]  # of `results.json`
 Tests = Mapping[str, SimulatorTests]
 ROWS = (BY_HAND, OPTIMISED, "rl_paper", "rl", STRONGEST)
 PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
+SAMPLE = ("rl_paper", "rl_critic", BY_HAND, OPTIMISED)  # drawn in Fig. 6
 BOUND = 0.0097  # m/s, of `benchmarks/perfect_model.py`, which knows the plant of the Brokk 170
+WIDTH = 10.0  # inch, of every figure, so that letters have one size in the report
+LINES = ("-", "--", "-.", ":")
 
 
 @style.context("default")  # not the settings of the owner for his own pictures
@@ -34,16 +42,15 @@ def write_report(
 ) -> None:
     """Write `report.html` to the folder `out`; `measured` is what the paper's figures show."""
     tests, gap, traces = measured
-    starts, table = np.array(results["starts"]), first_table(results)
+    starts = np.array(results["starts"])
     drawn = {
-        "errors": figures.plot_errors({c: table[c]["velocity_error_mean"] for c in ROWS}),
-        "tests": figures.plot_tests(machine, tests),
-        "gap": figures.plot_gap(machine, gap),
-        "starts": figures.plot_starts(machine, starts),
-        "joints": figures.plot_joint_velocities(machine, traces, "x"),
+        "tests": plot_tests(machine, tests),
+        "gap": plot_gap(machine, gap),
+        "starts": plot_starts(machine, starts),
+        "joints": plot_joint_velocities(machine, traces, "x"),
     }
     for axis in axis_sequences(machine):
-        drawn[axis.name] = figures.plot_sequence(machine, traces, axis, starts)
+        drawn[axis.name] = plot_sequence(machine, traces, axis, starts)
     images = {name: png(figure) for name, figure in tqdm(drawn.items(), "draw", disable=None)}
     with whole_file(out / "report.html", "w") as file:
         file.write(render(results, images))
@@ -71,3 +78,95 @@ def render(results: Results, images: Mapping[str, str]) -> str:
     page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, titles=TITLES)
     page.globals.update(rest=valves_at_rest, interval=interval_text)
     return page.render(results=results, images=images, bound=bound, table=first_table(results))
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+
+def draw(ax: Axes, curves: Curves, xlabel: str, ylabel: str, title: str = "") -> None:
+    """Curves with their labels, and titles of the axes with units."""
+    for i, (label, (x, y)) in enumerate(curves.items()):
+        line = LINES[i % len(LINES)]
+        ax.plot(x, y, line, color=f"C{i}", label=TITLES.get(label, label), linewidth=1.1)
+    ax.set(title=title, xlabel=xlabel, ylabel=ylabel)
+    ax.grid(alpha=0.3)
+
+
+def plot_over_time(
+    dt: float,
+    rows: Sequence[tuple[Sequence[str], Mapping[str, Array]]],
+    sharey: Literal["none", "row"] = "none",
+) -> Figure:
+    """Rows of plots, one for each of the row's labels: columns of its curves (T, labels)."""
+    figure = Figure((WIDTH, 2.6 * len(rows) + 0.3), layout="constrained")
+    axes = figure.subplots(len(rows), len(rows[0][0]), squeeze=False, sharey=sharey)
+    for row, (labels, curves) in zip(axes, rows, strict=True):
+        for i, label in enumerate(labels):
+            columns = {name: (dt * np.arange(1, len(y) + 1), y[:, i]) for name, y in curves.items()}
+            draw(row[i], columns, "time [s]", label)
+    axes[0, 0].legend(fontsize="small")
+    return figure
+
+
+def plot_tests(machine: Machine, tests: Tests) -> Figure:
+    """Range and direction, coupling, and past movement; machine above nets. Paper: Fig. 2"""
+    name = machine.names[machine.driven[-1]]
+    angle, velocity = f"{name} [rad]", f"velocity {name} [rad/s]"
+    time = "time after the step [s]"
+    figure = Figure((WIDTH, 5.5), layout="constrained")
+    axes = figure.subplots(2, 3, sharey="col")
+    for row, (kind, of) in zip(axes, tests.items(), strict=True):
+        draw(row[0], of.sweeps, angle, velocity, f"{kind}: range and direction")
+        draw(row[1], of.coupling, angle, velocity, f"{kind}: coupling")
+        draw(row[2], of.past_movement, time, velocity, f"{kind}: past movement")
+        for ax in row:
+            ax.legend(fontsize="small")
+    return figure
+
+
+def plot_gap(machine: Machine, gap: Motion) -> Figure:
+    """Nets less machine under the same commands: tool, and a row for each joint. Paper: Fig. 5"""
+    moved = {"tool": ("m", norm(gap.v_tool, axis=-1), norm(gap.p_tool, axis=-1))}
+    moved |= {machine.names[i]: ("rad", gap.q_dot[..., i], gap.q[..., i]) for i in machine.driven}
+    rows = []
+    for name, (unit, velocity, position) in moved.items():
+        values = np.stack([velocity, 1000 * position], axis=1)  # (T, 2, runs)
+        curves = {"median of all runs": np.median(values, axis=-1), "first run": values[..., 0]}
+        rows.append(([f"{name} [{unit}/s]", f"{name} [m{unit}]"], curves))
+    return plot_over_time(machine.dt, rows)
+
+
+def plot_starts(machine: Machine, starts: Array) -> Figure:
+    """Start configurations drawn as arms, from the side and from above. Paper: Fig. 6a"""
+    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+    side, top = figure.subplots(1, 2)
+    points = forward_kinematics(machine, starts).p  # (starts, points, 3)
+    tool = points[:, -1, :2]
+    outward = tool / np.maximum(norm(tool, axis=-1, keepdims=True), 1e-9)
+    r = np.einsum("pjk,pk->pj", points[..., :2], outward)
+    side.plot(r.T, points[..., 2].T, alpha=0.6)
+    top.plot(points[..., 0].T, points[..., 1].T, alpha=0.6)
+    side.axhline(machine.ground, color="black", linewidth=0.8)
+    side.set(xlabel="outward from the slew axis [m]", ylabel="z [m]", aspect="equal")
+    top.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    return figure
+
+
+def plot_sequence(machine: Machine, traces: Traces, sequence: Commands, starts: Array) -> Figure:
+    """Tool position and velocity along x, y, z of `SAMPLE` from the first start. Paper: Fig. 6"""
+    goals = sequence.for_starts(machine, starts)[:, 0]
+    p_start = tool_position(forward_kinematics(machine, starts[0]))
+    positions, velocities = {"goal": machine.dt * np.cumsum(goals, axis=0)}, {"goal": goals}
+    for name in SAMPLE:
+        trace = traces[name, sequence.name]
+        positions[name], velocities[name] = trace.p_tool[:, 0] - p_start, trace.v_tool[:, 0]
+    above = [f"{axis} - {axis}(0) [m]" for axis in AXES], positions
+    below = [f"velocity {axis} [m/s]" for axis in AXES], velocities
+    return plot_over_time(machine.dt, [above, below], sharey="row")
+
+
+def plot_joint_velocities(machine: Machine, traces: Traces, sequence: str) -> Figure:
+    """Velocity of the driven joints of `SAMPLE` from the first start. Paper: Fig. 6d"""
+    labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
+    curves = {name: traces[name, sequence].q_dot[:, 0, machine.driven] for name in SAMPLE}
+    return plot_over_time(machine.dt, [(labels, curves)], sharey="row")
