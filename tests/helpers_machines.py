@@ -7,7 +7,7 @@ import numpy as np
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.strong_pid import StrongGains
 from brokk_min.env import Measured, measure
-from brokk_min.evaluation import baselines
+from brokk_min.evaluation import baselines, sequences
 from brokk_min.identification.logs import Recording, velocity_of
 from brokk_min.jacobian import Gains
 from brokk_min.machine import BROKK_170, Machine
@@ -163,6 +163,13 @@ def pids(machine, net):
     return baselines.baselines(
         machine, net, dict.fromkeys(names, pid) | {baselines.STRONGEST: strong}
     )
+
+
+def short_axes(ticks, before=0):
+    """Sequences along x, y and z of so many ticks, from `before` ticks before the first motion."""
+    axes = sequences.axis_sequences(BROKK_170)
+    first = [np.flatnonzero(axis.goals.any(axis=1))[0] - before for axis in axes]
+    return [axis._replace(goals=axis.goals[i : i + ticks]) for i, axis in zip(first, axes)]
 
 
 def one_by_one(calls, needs=None, scheduler=None):

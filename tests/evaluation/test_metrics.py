@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from helpers_machines import Idle, obedient_net, pids
+from helpers_machines import Idle, obedient_net, pids, short_axes
 
 from brokk_min.evaluation import metrics as m
 from brokk_min.evaluation.rollout import Trace
-from brokk_min.evaluation.sequences import task_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 
@@ -65,21 +64,14 @@ STARTS = np.array([BROKK_170.q_start, [1.0, 0.5, 0.9, 1.5, 1.0]])
 PID = pids(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
 
 
-def shortened(ticks):
-    """From 0.5 s before the first move."""
-    axes = task_sequences(BROKK_170)[:3]
-    first = [np.flatnonzero(s.goals.any(axis=1))[0] - 10 for s in axes]
-    return [s._replace(goals=s.goals[t : t + ticks]) for s, t in zip(axes, first, strict=True)]
-
-
 def test_evaluate__gives_rows_in_order_with_their_figures():
     controllers = {"pid": PID, "idle": Idle()}
-    rows, traces = m.evaluate(BROKK_170, controllers, shortened(50), STARTS, 0)
+    rows, traces = m.evaluate(BROKK_170, controllers, short_axes(50, 10), STARTS, 0)
     labels = [(c, s, i, "workspace") for c in controllers for s in "xyz" for i in (0, 1)]
     assert [tuple(row[key] for key in m.LABELS[:4]) for row in rows] == labels
     assert set(traces) == {(c, s) for c in controllers for s in "xyz"}
     p_start = tool_position(forward_kinematics(BROKK_170, STARTS))
-    goals = shortened(50)[1].for_starts(BROKK_170, STARTS)
+    goals = short_axes(50, 10)[1].for_starts(BROKK_170, STARTS)
     expected = m.metrics(BROKK_170, traces["pid", "y"], goals, p_start)
     for row in rows[2:4]:
         for key, values in expected.items():
@@ -90,10 +82,10 @@ def test_evaluate__gives_rows_in_order_with_their_figures():
 
 def test_evaluate__ends_each_sequence_at_its_own_length():
     """All are one batch with the same noise, whatever the length of others."""
-    mixed = shortened(40)
-    mixed[1] = shortened(30)[1]
+    mixed = short_axes(40, 10)
+    mixed[1] = short_axes(30, 10)[1]
     rows, traces = m.evaluate(BROKK_170, {"pid": PID}, mixed, STARTS, 0)
-    longer, same = m.evaluate(BROKK_170, {"pid": PID}, shortened(40), STARTS, 0)
+    longer, same = m.evaluate(BROKK_170, {"pid": PID}, short_axes(40, 10), STARTS, 0)
     for axis in "xz":
         np.testing.assert_array_equal(traces["pid", axis].q, same["pid", axis].q)
     assert rows[4:] == longer[4:]

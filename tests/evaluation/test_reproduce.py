@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_cli import run
-from helpers_machines import one_by_one
+from helpers_machines import POSE, Idle, obedient_net, one_by_one, pids, short_axes
 
-from brokk_min.evaluation import baselines, report, reproduce
+from brokk_min.evaluation import baselines, metrics, report, reproduce
 from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.rollout import TITLES
@@ -98,3 +98,35 @@ def test_reproduce__answers_each_sentence_of_the_paper_on_one_page(folder, resul
     page = (folder / "report.html").read_text()
     assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 7
     assert page.count("<blockquote>") == len(TEXTS)
+
+
+def test_variations__change_what_they_say():
+    result = reproduce.variations(BROKK_170)
+    assert len(result) == 8 and result["nominal"] is BROKK_170
+    zones = BROKK_170.dead_zones
+    changed = {
+        "supply flow -70 %": ("pump_flow", 0.000315),
+        "valve gain -20 %": ("cylinder_speeds", 0.8 * BROKK_170.cylinder_speeds),
+        "valve gain +20 %": ("cylinder_speeds", 1.2 * BROKK_170.cylinder_speeds),
+        "up -15 %, down +15 %": ("cylinder_speeds", BROKK_170.cylinder_speeds * [0.85, 1.15]),
+        "dead zone 5 %": ("dead_zones", 0 * zones + 0.05),
+        "dead zone 10 %": ("dead_zones", 0 * zones + 0.1),
+        "delay +50 ms": ("delay", 0.09),
+    }
+    for name, (field, value) in changed.items():
+        np.testing.assert_allclose(getattr(result[name], field), value)
+
+
+def test_robustness__has_a_row_for_each_variation_and_controller():
+    pid = pids(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_ff_integral"]
+    task = {"idle": Idle(), "pid": pid}, short_axes(20, 2)[2:], np.tile(POSE, (2, 1)), 0
+    table = reproduce.robustness(BROKK_170, *task)
+    assert list(table) == [*reproduce.variations(BROKK_170), "goals +50 %"]
+    runs, _ = metrics.evaluate(reproduce.variations(BROKK_170)["delay +50 ms"], *task)
+    error = metrics.by_start(runs, "pid", "all", ERROR)
+    assert table["delay +50 ms"]["pid"] == metrics.mean_interval(error)
+    errors = {name: row["pid"]["mean"] for name, row in table.items()}
+    assert errors["nominal"] < min(errors["delay +50 ms"], errors["dead zone 10 %"])
+    assert table["delay +50 ms"]["idle"] == table["nominal"]["idle"]
+    faster = 1.5 * table["nominal"]["idle"]["mean"]
+    assert table["goals +50 %"]["idle"]["mean"] == pytest.approx(faster)

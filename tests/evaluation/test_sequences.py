@@ -1,7 +1,6 @@
 """Sequences and starts: by hand, from files, feasible, and apart from those for tuning."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -22,15 +21,11 @@ def hold_table(goals):
     return np.concatenate([seconds[:, None], goals[first]], axis=1)
 
 
-# --- sequences ------------------------------------------------------------------------------------
-
-
 def test_axis_sequences__move_along_one_axis_and_back():
     """At two thirds and one third of the largest tool speed."""
-    for i, sequence in enumerate(s.axis_sequences(replace(BROKK_170, tool_speed=0.6))):
-        assert not np.delete(sequence.goals, i, axis=1).any()
-        speeds = np.unique(sequence.goals[:, i].round(9))
-        np.testing.assert_allclose(speeds, [-0.4, -0.2, 0, 0.2, 0.4])
+    for i, (_, goals, _) in enumerate(s.axis_sequences(replace(BROKK_170, tool_speed=0.6))):
+        assert not np.delete(goals, i, axis=1).any()
+        np.testing.assert_allclose(np.unique(goals[:, i].round(9)), [-0.4, -0.2, 0, 0.2, 0.4])
 
 
 def test_task_sequences__last_26_seconds_and_end_at_rest_where_they_began():
@@ -79,9 +74,6 @@ def test_task_sequences__by_hand():
     np.testing.assert_allclose(moves["slow"], slow)
 
 
-# --- files ----------------------------------------------------------------------------------------
-
-
 def test_read_commands__holds_values_until_the_next_row(tmp_path):
     path = tmp_path / "c.csv"
     rows = "a,5,1,2,3\na,5.1,4,5,6\na,5.15,0,0,0\nb,0,7,8,9\nb,0.05,0,0,0\n"
@@ -117,16 +109,12 @@ def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row)
         s.read_starts(path, BROKK_170)
 
 
-# --- start poses ----------------------------------------------------------------------------------
-
-
 def test_evaluation_starts__of_the_package_are_those_of_reproduce():
-    starts = s.evaluation_starts(BROKK_170, 32, [], 0)
+    starts, sequences = s.evaluation_starts(BROKK_170, 32, [], 0), s.task_sequences(BROKK_170)
     assert len(np.unique(starts, axis=0)) == 32
     assert np.histogram(starts[:, 0], [-2.14, -0.7, 0.7, 2.14])[0].min() >= 5
-    drawn = s.draw_starts(BROKK_170, 2, s.task_sequences(BROKK_170), 2)
-    np.testing.assert_array_equal(drawn, starts[:2])
-    for sequence in s.task_sequences(BROKK_170):
+    np.testing.assert_array_equal(s.draw_starts(BROKK_170, 2, sequences, 2), starts[:2])
+    for sequence in sequences:
         goals = sequence.for_starts(BROKK_170, starts)
         assert s.feasible(BROKK_170, starts, goals).all(), sequence.name
     with pytest.raises(ValueError, match=r"starts.csv: expected at most 32 starts, got 33"):
@@ -148,9 +136,6 @@ def test_draw_starts__refuses_a_machine_that_can_follow_nothing(monkeypatch):
         s.draw_starts(BROKK_170, 2, sequences, 0)
 
 
-# --- feasible paths -------------------------------------------------------------------------------
-
-
 def follows(start, goals=STILL, machine=BROKK_170):
     return bool(s.feasible(machine, start[None], goals)[0])
 
@@ -168,11 +153,9 @@ def test_feasible__refuses_a_path_through_a_singularity():
 @pytest.mark.parametrize("joint", BROKK_170.driven)
 @pytest.mark.parametrize("end", ["q_min", "q_max"])
 def test_feasible__keeps_a_margin_to_joint_limits(joint, end):
-    inward = 1 if end == "q_min" else -1
-    near = np.array([0.0, *START[1:]])
-    far = near.copy()
-    near[joint] = BROKK_170.column(end)[joint] + inward * 0.049
-    far[joint] = BROKK_170.column(end)[joint] + inward * 0.051
+    near, far = np.tile([0.0, *START[1:]], (2, 1))
+    inward = np.array([0.049, 0.051]) * (1 if end == "q_min" else -1)
+    near[joint], far[joint] = BROKK_170.column(end)[joint] + inward
     high_enough = lowest_point(forward_kinematics(BROKK_170, far)) > 0.1
     assert not follows(near) and follows(far) == high_enough
 
@@ -199,18 +182,13 @@ def test_feasible__compares_tool_and_path_at_the_same_tick():
     assert follows(np.array([0.0, *START[1:]]), sideways, replace(BROKK_170, rate=10.0))
 
 
-# --- tuning ---------------------------------------------------------------------------------------
-
-
 def test_tuning_set__is_feasible_and_rests_for_long():
     starts, goals = s.tuning_set(BROKK_170, 8, 7)
     assert starts.shape == (8, 5) and goals.shape == (400, 8, 3)
     assert s.feasible(BROKK_170, starts, goals).all()
     assert np.linalg.norm(goals, axis=-1).max() <= BROKK_170.tool_speed + 1e-6
-    holds, rests = [], []
-    for run in goals.swapaxes(0, 1):
-        changes = np.flatnonzero(np.abs(np.diff(run, axis=0)).max(axis=1)) + 1
-        for begin, end in pairwise([0, *changes]):  # the last hold is cut short
-            (holds if run[begin].any() else rests).append((end - begin) / 20)
+    table = np.concatenate([hold_table(run)[:-1] for run in goals.swapaxes(0, 1)])  # but the last
+    moves = table[:, 1:].any(axis=1)
+    holds, rests = table[moves, 0], table[~moves, 0]
     assert min(holds) >= 0.5 and min(rests) >= 0.5
     assert 2 < max(holds) <= 3 and max(rests) > 5  # two rests may be one

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_cli import run
-from helpers_machines import POSE, one_by_one, small_net
+from helpers_machines import POSE, one_by_one, short_axes, small_net
 
 from brokk_min.evaluation import metrics, sweep
-from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.identification.net_file import save_net
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.recipes import Recipe
@@ -20,7 +19,7 @@ TINY = PPOConfig(num_envs=4, horizon=4, epochs=1, minibatch_size=16, total_steps
 RECIPE = Recipe("paper", True, TaskConfig(episode_s=0.6), TINY)
 NET = small_net(BROKK_170, np.random.default_rng(0))
 POSES = POSE + 0.1 * np.random.default_rng(0).random((2, 5))
-SEQUENCES = [s._replace(goals=s.goals[s.goals.any(axis=1)][:10]) for s in axis_sequences(BROKK_170)]
+SEQUENCES = short_axes(10)
 
 
 @pytest.fixture(autouse=True)
