@@ -24,6 +24,7 @@ OPTIMISED = "jacobian_pid_k0.1"
 PAPER_BASELINES = (OPTIMISED, "jacobian_pid_k0.05")
 STRONGEST = "jacobian_pid_ff_integral"
 TUNED = {OPTIMISED: 1, STRONGEST: 2}  # by `tune`, with so many times the generations below
+Baselines = dict[str, JacobianController]  # by name
 Effort = tuple[int, int, float]  # of tuning: generations, runs of a candidate, their length [s]
 EFFORT: Effort = (40, 30, 20.0)  # assumed
 CANDIDATES = 24  # of each generation
@@ -43,7 +44,7 @@ RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, 
 
 def baselines(
     machine: Machine, net: ActuatorNet, gains: Mapping[str, Any] | None = None
-) -> dict[str, JacobianController]:
+) -> Baselines:
     """PIDs with the paper's structure, and the strongest, by default with `first_gains`.
 
     The raw one does not compensate the dead zone. Both with the paper's two k have the same gains,
@@ -101,24 +102,19 @@ def gains_by_hand(machine: Machine, known: Machine, plant: Plant = PLANT) -> Gai
     tried = np.geomspace(0.05, 50, 70)  # 10 % apart
     kp, ki = np.zeros((2, len(machine.driven)))
     for i in range(len(kp)):
-        trial = partial(overshoots, machine, known, plant, i)
-        kp[i] = tried[last_below(trial(tried, 0 * tried))] / 2
-        ki[i] = tried[last_below(trial(0 * tried + kp[i], tried))]
+        last = partial(last_before_overshoot, machine, known, plant, i)
+        kp[i] = tried[last(tried, 0 * tried)] / 2
+        ki[i] = tried[last(0 * tried + kp[i], tried)]
     return Gains(kp, ki, 0 * kp, np.full(1, 0.4))
 
 
-def last_below(over: Array) -> int:
-    """The row before the first that overshoots by more than `OVERSHOOT`, or the last, or 0."""
-    return max(int(np.argmax(np.append(over, np.inf) > OVERSHOOT)) - 1, 0)
-
-
-def overshoots(
+def last_before_overshoot(
     machine: Machine, known: Machine, plant: Plant, index: int, kp: Array, ki: Array
-) -> Array:
-    """Overshoot of steps of one driven joint, as a fraction of them, by gains (rows,): (rows,).
+) -> int:
+    """Of rising gains (rows,) of one driven joint the last row before one overshoots too much.
 
     A step goes from rest amid all ranges to a third of the joint's fastest motion up, or down, for
-    2 s, and back to rest. The larger overshoot of both counts.
+    2 s, and back to rest.
     """
     joint, alone = machine.driven[index], np.eye(len(machine.driven))[index]
     fastest = machine.column("q_dot_up")[joint], -machine.column("q_dot_down")[joint]
@@ -132,7 +128,8 @@ def overshoots(
     trace = rollout(machine, step, middle, goals, 0.0, np.random.default_rng(0), plant)
     velocity = trace.q_dot[..., joint] / goal
     over = np.maximum(velocity.max(axis=0) - 1, -velocity[ticks:].min(axis=0))
-    return np.asarray(over.reshape(2, -1).max(axis=0))
+    too_much = (over.reshape(2, -1) > OVERSHOOT).any(axis=0)
+    return max(0, int(np.argmax([*too_much, True])) - 1)
 
 
 def gains_of(like: Gains, vector: Array) -> Any:
@@ -192,7 +189,7 @@ def tune(gains: Gains, cost: Callable[[Array], Array], seed: int, generations: i
 
 def tuned_baselines(
     machine: Machine, net: ActuatorNet, effort: Effort, seed: int, plant: Plant = PLANT
-) -> dict[str, JacobianController]:
+) -> Baselines:
     """The `baselines` with gains by hand, and with tuned ones.
 
     The runs are on the `plant` itself, which favours the baselines: policies see nets alone.
@@ -212,20 +209,15 @@ def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, str]:
     return {"machine": machine.name, "actuator": fingerprint(net)}
 
 
-def write_gains(
-    path: Path, controllers: Mapping[str, JacobianController], meta: Mapping[str, Any]
-) -> None:
+def write_gains(path: Path, pids: Baselines, meta: Mapping[str, Any]) -> None:
     """Write gains as `read_gains` reads them; `meta` includes `gains_metadata`."""
-    every = {name: vars(controller.gains) for name, controller in controllers.items()}
+    every = {name: vars(pid.gains) for name, pid in pids.items()}
     gains = {name: {k: array.tolist() for k, array in of.items()} for name, of in every.items()}
     write_json(path, {"meta": meta, "gains": gains})
 
 
-def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> dict[str, JacobianController]:
-    """The baselines with gains that `write_gains` wrote.
-
-    ValueError: no such file, or gains of another machine or of other nets.
-    """
+def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> Baselines:
+    """The baselines with gains of a file; ValueError: those of another machine or other nets."""
     with expected(path, "gains of `reproduce` or `evaluate --save-gains`"):
         file = read_json(path, "JSON")
         expect_same(path, file["meta"], gains_metadata(machine, net))

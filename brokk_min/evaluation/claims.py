@@ -17,9 +17,7 @@ from brokk_min.evaluation.metrics import Mean, Run, by_start, mean_interval
 from brokk_min.evaluation.preliminary import Motion, SimulatorTests, response_time
 from brokk_min.evaluation.rollout import TITLES
 
-TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
-    Path(__file__).with_suffix(".toml").read_text("utf-8")
-)
+TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 POLICIES = ("rl_paper", "rl_critic")  # the paper's agent
 PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure, by hand first
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
@@ -60,9 +58,8 @@ def net_claims(nets: SimulatorTests, gap: Motion) -> list[dict[str, Any]]:
         "idle": {"idle over moving": idle / moving if idle and moving else None},
         "gap": {"in the figure": float(errors[0]), "median of runs": float(np.median(errors))},
     }
-    ends = ("mean", "low", "high")
     return [
-        claim(name, {"nets": {what: dict.fromkeys(ends, x) for what, x in row.items()}})
+        claim(name, {"nets": {what: {"mean": x, "low": x, "high": x} for what, x in row.items()}})
         for name, row in table.items()
     ]
 

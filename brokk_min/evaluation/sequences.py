@@ -89,7 +89,7 @@ def task_sequences(machine: Machine) -> list[Commands]:
 def along(direction: ArrayLike) -> Array:
     """Rows of the pattern `AXIS` along a unit vector (3,)."""
     seconds, speed = np.transpose(AXIS)
-    return np.column_stack([seconds, np.outer(speed, direction)])
+    return np.column_stack([seconds, np.outer(speed, np.asarray(direction, float))])
 
 
 def _with_rests(rows: Array, rng: np.random.Generator) -> Array:

@@ -33,9 +33,9 @@ def test_first_gains__by_hand_are_those_of_the_rule():
     gains = baselines.first_gains(BROKK_170)
     hand = gains["pid_by_hand"]
     for i, (p, k) in enumerate(zip(hand.kp, hand.ki, strict=True)):
-        rows = np.array([[2 * p, 0], [p, k], [2.22 * p, 0], [p, 1.11 * k]]).T
-        over = baselines.overshoots(BROKK_170, BROKK_170, PLANT, i, *rows)
-        assert (over[:2] <= 0.2).all() and (over[2:] > 0.2).all()
+        for rows in ([[0, 2 * p, 2.22 * p], [0, 0, 0]], [[p, p, p], [0, k, 1.11 * k]]):
+            trial = BROKK_170, BROKK_170, PLANT, i, *np.array(rows)
+            assert baselines.last_before_overshoot(*trial) == 1
     assert not hand.kd.any() and (gains["pid_by_hand_raw"].kp > hand.kp).all()
 
 
