@@ -65,32 +65,25 @@ PID = pids(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_k0.1"]
 
 
 def test_evaluate__gives_rows_in_order_with_their_figures():
-    controllers = {"pid": PID, "idle": Idle()}
-    rows, traces = m.evaluate(BROKK_170, controllers, short_axes(50, 10), STARTS, 0)
+    """All sequences are one batch with the same noise, whatever the length of others."""
+    controllers, sequences = {"pid": PID, "idle": Idle()}, short_axes(50, 10)
+    every, alike = m.evaluate(BROKK_170, {"pid": PID}, sequences, STARTS, 0)
+    sequences[1] = sequences[1]._replace(goals=sequences[1].goals[:30])
+    rows, traces = m.evaluate(BROKK_170, controllers, sequences, STARTS, 0)
     labels = [(c, s, i, "workspace") for c in controllers for s in "xyz" for i in (0, 1)]
     assert [tuple(row[key] for key in m.LABELS[:4]) for row in rows] == labels
+    assert rows[:2] + rows[4:6] == every[:2] + every[4:]
     assert set(traces) == {(c, s) for c in controllers for s in "xyz"}
+    np.testing.assert_array_equal(traces["pid", "z"].q, alike["pid", "z"].q)
+    np.testing.assert_array_equal(traces["pid", "y"].u, alike["pid", "y"].u[:30])
     p_start = tool_position(forward_kinematics(BROKK_170, STARTS))
-    goals = short_axes(50, 10)[1].for_starts(BROKK_170, STARTS)
+    goals = sequences[1].for_starts(BROKK_170, STARTS)
     expected = m.metrics(BROKK_170, traces["pid", "y"], goals, p_start)
     for row in rows[2:4]:
         for key, values in expected.items():
             assert row[key] == values[row["start"]], key
     pid, idle = (m.means(rows)[c]["all"]["velocity_error_mean"]["mean"] for c in controllers)
     assert pid < idle
-
-
-def test_evaluate__ends_each_sequence_at_its_own_length():
-    """All are one batch with the same noise, whatever the length of others."""
-    mixed = short_axes(40, 10)
-    mixed[1] = short_axes(30, 10)[1]
-    rows, traces = m.evaluate(BROKK_170, {"pid": PID}, mixed, STARTS, 0)
-    longer, same = m.evaluate(BROKK_170, {"pid": PID}, short_axes(40, 10), STARTS, 0)
-    for axis in "xz":
-        np.testing.assert_array_equal(traces["pid", axis].q, same["pid", axis].q)
-    assert rows[4:] == longer[4:]
-    assert traces["pid", "y"].v_tool.shape == (30, 2, 3)
-    np.testing.assert_array_equal(traces["pid", "y"].u, same["pid", "y"].u[:30])
 
 
 def test_mean_interval__of_one_value_or_equal_ones():

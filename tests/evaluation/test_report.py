@@ -5,6 +5,7 @@ from collections import defaultdict
 from types import SimpleNamespace
 
 import numpy as np
+from helpers_machines import POSE
 
 from brokk_min._files import SHIPPED, read_json
 from brokk_min.evaluation import metrics, report
@@ -75,10 +76,6 @@ def test_render__sets_a_trial_beside_the_shipped_results_and_their_bound():
     assert numbers[0] == "0.0303"
 
 
-# --- figures --------------------------------------------------------------------------------------
-
-
-POSE = np.array(BROKK_170.q_start)
 RNG = np.random.default_rng(0)
 
 
@@ -97,11 +94,11 @@ def test_plot_tests__shows_machine_above_nets():
         sweeps, coupling = {"u = 50": (x, k * x)}, {"alone": (x, -k * x)}
         rows[kind] = SimulatorTests(sweeps, coupling, {"from idle": (x, k + x)})
     figure = report.plot_tests(BROKK_170, rows)
-    titles = [ax.get_title() for ax in figure.axes[2:4]]
-    assert titles == ["machine: past movement", "nets: range and direction"]
-    np.testing.assert_array_equal(curves(figure.axes[3])["u = 50"], [x, 2 * x])
-    np.testing.assert_array_equal(curves(figure.axes[4])["alone"], [x, -2 * x])
-    np.testing.assert_array_equal(curves(figure.axes[5])["from idle"], [x, 2 + x])
+    *_, past_movement, sweeps, coupling, steps = figure.axes
+    assert past_movement.get_title() == "machine: past movement"
+    np.testing.assert_array_equal(curves(sweeps)["u = 50"], [x, 2 * x])
+    np.testing.assert_array_equal(curves(coupling)["alone"], [x, -2 * x])
+    np.testing.assert_array_equal(curves(steps)["from idle"], [x, 2 + x])
 
 
 def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
