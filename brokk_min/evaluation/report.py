@@ -63,21 +63,18 @@ def png(figure: Figure) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def first_table(results: Results) -> Results:
-    """Means along x, y and z by controller: of these results, or of shipped ones for a trial."""
-    shipped = SHIPPED / results["meta"]["machine"] / "table.json"
-    trial = results["meta"]["effort"]["hours"] < 1 and shipped.exists()
-    return (read_json(shipped, "JSON") if trial else results)["table"]  # type: ignore[no-any-return]
-
-
 def render(results: Results, images: Mapping[str, str]) -> str:
-    """The page, with PNG `images` in base64 by name."""
+    """The page, with PNG `images` in base64 by name; a trial begins with the shipped table."""
+    about = results["meta"]
+    shipped = SHIPPED / about["machine"] / "table.json"
+    trial = about["effort"]["hours"] < 1 and shipped.exists()
+    table = (read_json(shipped, "JSON") if trial else results)["table"]
+    bound = BOUND if about["machine"] == BROKK_170.name else None
     text = Path(__file__).with_suffix(".html.j2").read_text("utf-8")
-    bound = BOUND if results["meta"]["machine"] == BROKK_170.name else None
     page: Template = Template(text, autoescape=True, undefined=StrictUndefined)
     page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, titles=TITLES)
     page.globals.update(rest=valves_at_rest, interval=interval_text)
-    return page.render(results=results, images=images, bound=bound, table=first_table(results))
+    return page.render(results=results, images=images, bound=bound, table=table)
 
 
 # --- figures --------------------------------------------------------------------------------------
