@@ -103,14 +103,14 @@ def test_reproduce__answers_each_sentence_of_the_paper_on_one_page(folder, resul
 def test_variations__change_what_they_say():
     result = reproduce.variations(BROKK_170)
     assert len(result) == 8 and result["nominal"] is BROKK_170
-    zones = BROKK_170.dead_zones
+    speeds = BROKK_170.cylinder_speeds
     changed = {
         "supply flow -70 %": ("pump_flow", 0.000315),
-        "valve gain -20 %": ("cylinder_speeds", 0.8 * BROKK_170.cylinder_speeds),
-        "valve gain +20 %": ("cylinder_speeds", 1.2 * BROKK_170.cylinder_speeds),
-        "up -15 %, down +15 %": ("cylinder_speeds", BROKK_170.cylinder_speeds * [0.85, 1.15]),
-        "dead zone 5 %": ("dead_zones", 0 * zones + 0.05),
-        "dead zone 10 %": ("dead_zones", 0 * zones + 0.1),
+        "valve gain -20 %": ("cylinder_speeds", 0.8 * speeds),
+        "valve gain +20 %": ("cylinder_speeds", 1.2 * speeds),
+        "up -15 %, down +15 %": ("cylinder_speeds", speeds * [0.85, 1.15]),
+        "dead zone 5 %": ("dead_zones", np.full((5, 2), 0.05)),
+        "dead zone 10 %": ("dead_zones", np.full((5, 2), 0.1)),
         "delay +50 ms": ("delay", 0.09),
     }
     for name, (field, value) in changed.items():
