@@ -14,7 +14,7 @@ import numpy as np
 
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, RAW
 from brokk_min.evaluation.metrics import Mean, Run, by_start, mean_interval
-from brokk_min.evaluation.preliminary import Motion, SimulatorTests, response_time
+from brokk_min.evaluation.preliminary import Motion, Tests, response_time
 from brokk_min.evaluation.rollout import TITLES
 
 TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
@@ -44,14 +44,14 @@ def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any
     return known | {"numbers": numbers, "verdicts": verdicts}
 
 
-def net_claims(nets: SimulatorTests, gap: Motion) -> list[dict[str, Any]]:
+def net_claims(nets: Tests, gap: Motion) -> list[dict[str, Any]]:
     """Do the nets behave as the paper's machine?
 
     The plant was made after the paper's figures, so verdicts on it could not fail. These are single
     tests, so they have no interval. Paper: Sec. 3.2 and 4.1, Fig. 2 and 5
     """
-    _, up, down, _ = (np.abs(q_dot).max() for _, q_dot in nets.sweeps.values())
-    idle, moving = (response_time(*curve) for curve in nets.past_movement.values())
+    _, up, down, _ = (np.abs(q_dot).max() for _, q_dot in nets["range and direction"].values())
+    idle, moving = (response_time(*curve) for curve in nets["past movement"].values())
     errors = np.linalg.norm(gap.p_tool, axis=-1).mean(axis=0)  # m, of each run
     table: dict[str, dict[str, float | None]] = {
         "gravity": {"down over up": float(down / up)},

@@ -21,14 +21,7 @@ GAP_S = 30.0  # s, paper
 GAP_RUNS = 20  # assumed
 
 Curves = Mapping[str, tuple[Array, Array]]  # x and y, (T,) each
-
-
-class SimulatorTests(NamedTuple):
-    """The preliminary tests of one simulator with its last driven joint."""
-
-    sweeps: Curves  # velocity [rad/s] over angle [rad], by PWM byte
-    coupling: Curves  # at the command limit, alone and with the other joints
-    past_movement: Curves  # velocity [rad/s] over time [s] around a step, from idle and moving
+Tests = Mapping[str, Curves]  # the curves of each of the paper's tests
 
 
 class Motion(NamedTuple):
@@ -40,7 +33,7 @@ class Motion(NamedTuple):
     v_tool: Array  # m/s
 
 
-def run(machine: Machine, net: ActuatorNet, seed: int) -> tuple[dict[str, SimulatorTests], Motion]:
+def run(machine: Machine, net: ActuatorNet, seed: int) -> tuple[dict[str, Tests], Motion]:
     """Tests of the machine and of its nets, and nets less machine. Paper: Sec. 3.2 and 4.1"""
     both: dict[str, Plant] = {"machine": PLANT, "nets": select_nets(machine, net)}
     tests = {name: preliminary_tests(machine, plant) for name, plant in both.items()}
@@ -57,10 +50,11 @@ def simulate(machine: Machine, plant: Plant, q: Array, u: Array) -> Array:
     return np.array(angles, float)
 
 
-def preliminary_tests(machine: Machine, plant: Plant) -> SimulatorTests:
-    """Range and direction, coupling, past movement. Paper: Sec. 3.2, Fig. 2
+def preliminary_tests(machine: Machine, plant: Plant) -> Tests:
+    """Range and direction, coupling, past movement of the last driven joint.
 
-    The last driven joint goes from stop to stop, while the others begin amid their ranges.
+    It goes from stop to stop, while the others begin amid their ranges. Velocities [rad/s] over
+    angles [rad] are by PWM byte, and at the limit alone or with others. Paper: Sec. 3.2, Fig. 2
     """
     joint, others = machine.driven[-1], machine.driven[:-1]
     limit = machine.pwm_limit / PWM_MAX
@@ -78,12 +72,15 @@ def preliminary_tests(machine: Machine, plant: Plant) -> SimulatorTests:
     ends = [1 + np.max(np.flatnonzero(q_dot), initial=0) for q_dot in velocities.T]  # it stands
     *alone, together = [(angles[1 : end + 1, i], velocities[:end, i]) for i, end in enumerate(ends)]
     names = [f"u = {encode_pwm(level)}" for level in u[:4, joint]]
-    coupling = {"alone": alone[1], "with the others": together}
-    return SimulatorTests(dict(zip(names, alone, strict=True)), coupling, steps(machine, plant))
+    return {
+        "range and direction": dict(zip(names, alone, strict=True)),
+        "coupling": {"alone": alone[1], "with the others": together},
+        "past movement": steps(machine, plant),
+    }
 
 
 def steps(machine: Machine, plant: Plant) -> Curves:
-    """Velocity over time around a step up to the limit: from idle, and at half its opening.
+    """Velocity [rad/s] over time [s] at a step up to the limit, from idle and half its opening.
 
     The last driven joint begins at a tenth of its range. Paper: Sec. 3.2 (past movement)
     """

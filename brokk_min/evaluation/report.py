@@ -20,14 +20,14 @@ from tqdm import tqdm
 from brokk_min._files import SHIPPED, read_json, whole_file
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST
 from brokk_min.evaluation.metrics import COLUMNS, Traces, interval_text
-from brokk_min.evaluation.preliminary import Curves, Motion, SimulatorTests
+from brokk_min.evaluation.preliminary import Curves, Motion, Tests
 from brokk_min.evaluation.rollout import TITLES, valves_at_rest
 from brokk_min.evaluation.sequences import AXES, Commands, axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170, Array, Machine
 
 Results = Mapping[str, Any]  # of `results.json`
-Tests = Mapping[str, SimulatorTests]
+Measured = tuple[Mapping[str, Tests], Motion, Traces]  # of machine and nets, nets less machine
 ROWS = (BY_HAND, OPTIMISED, "rl_paper", "rl", STRONGEST)
 PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
 SAMPLE = ("rl_paper", "rl_critic", BY_HAND, OPTIMISED)  # drawn in Fig. 6
@@ -37,9 +37,7 @@ LINES = ("-", "--", "-.", ":")
 
 
 @style.context("default")  # not the settings of the owner for his own pictures
-def write_report(
-    out: Path, machine: Machine, results: Results, measured: tuple[Tests, Motion, Traces]
-) -> None:
+def write_report(out: Path, machine: Machine, results: Results, measured: Measured) -> None:
     """Write `report.html` to the folder `out`; `measured` is what the paper's figures show."""
     tests, gap, traces = measured
     starts = np.array(results["starts"])
@@ -105,18 +103,17 @@ def plot_over_time(
     return figure
 
 
-def plot_tests(machine: Machine, tests: Tests) -> Figure:
+def plot_tests(machine: Machine, both: Mapping[str, Tests]) -> Figure:
     """Range and direction, coupling, and past movement; machine above nets. Paper: Fig. 2"""
     name = machine.names[machine.driven[-1]]
     angle, velocity = f"{name} [rad]", f"velocity {name} [rad/s]"
     time = "time after the step [s]"
     figure = Figure((WIDTH, 5.5), layout="constrained")
     axes = figure.subplots(2, 3, sharey="col")
-    for row, (kind, of) in zip(axes, tests.items(), strict=True):
-        draw(row[0], of.sweeps, angle, velocity, f"{kind}: range and direction")
-        draw(row[1], of.coupling, angle, velocity, f"{kind}: coupling")
-        draw(row[2], of.past_movement, time, velocity, f"{kind}: past movement")
-        for ax in row:
+    for row, (kind, tests) in zip(axes, both.items(), strict=True):
+        for ax, (test, curves) in zip(row, tests.items(), strict=True):
+            xlabel = time if test == "past movement" else angle
+            draw(ax, curves, xlabel, velocity, f"{kind}: {test}")
             ax.legend(fontsize="small")
     return figure
 

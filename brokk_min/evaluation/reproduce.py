@@ -108,9 +108,7 @@ def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
     return side_by_side(jobs, needs)
 
 
-def measure(
-    chain: Chain, done: Mapping[str, Any]
-) -> tuple[dict[str, Any], tuple[report.Tests, preliminary.Motion, metrics.Traces]]:
+def measure(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], report.Measured]:
     """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
     net = select_nets(machine, done["net"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brokk_min.evaluation import claims
-from brokk_min.evaluation.preliminary import Motion, SimulatorTests
+from brokk_min.evaluation.preliminary import Motion
 from brokk_min.evaluation.rollout import TITLES
 
 HIGH, LOW, RAW = "jacobian_pid_k0.1", "pid_by_hand", "pid_by_hand_raw"
@@ -53,7 +53,8 @@ def test_net_claims__hold_where_nets_behave_as_the_papers_machine(change, expect
     like = {"up": 0.24, "down": 0.45, "idle": 0.4, "figure": 0.03, "median": 0.02} | change
     peaks = {"u = 50": 0.1, "u = 80": like["up"], "u = 175": -like["down"], "u = 205": -0.3}
     sweeps = {u: (TIME, np.array([0.0, peak])) for u, peak in peaks.items()}
-    nets = SimulatorTests(sweeps, {}, {"idle": step(like["idle"]), "moving": step(0.1)})
+    steps = {"idle": step(like["idle"]), "moving": step(0.1)}
+    nets = {"range and direction": sweeps, "past movement": steps}
     distances = np.array([like["figure"], like["median"], like["median"]])
     p = np.array([0.5, 1.5])[:, None, None] * distances[:, None] * [0.6, 0.8, 0.0]
     result = claims.net_claims(nets, Motion(p, p, p, p))

@@ -45,32 +45,33 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     np.testing.assert_allclose(u[0] * 127, counts)
     np.testing.assert_array_equal(q[:, 4], [LOW[4], LOW[4], HIGH[4], HIGH[4], LOW[4]])
     np.testing.assert_allclose(q[:, :4], np.tile(((LOW + HIGH) / 2)[:4], (5, 1)))
-    assert list(tests.sweeps) == ["u = 50", "u = 80", "u = 175", "u = 205"]
-    speeds = [q_dot[0] for _, q_dot in tests.sweeps.values()]
+    sweeps, coupling, steps = tests.values()
+    assert list(sweeps) == ["u = 50", "u = 80", "u = 175", "u = 205"]
+    speeds = [q_dot[0] for _, q_dot in sweeps.values()]
     assert speeds == pytest.approx([0.25, 0.25, -0.5, -0.5])
-    assert list(tests.coupling) == ["alone", "with the others"]
-    assert tests.coupling["alone"] is tests.sweeps["u = 80"]
-    time, velocity = tests.past_movement["idle"]
+    assert list(coupling) == ["alone", "with the others"]
+    assert coupling["alone"] is sweeps["u = 80"]
+    time, velocity = steps["idle"]
     np.testing.assert_allclose(time, 0.05 * (np.arange(60) - 29.5))
     np.testing.assert_allclose(velocity, np.where(time < 0, 0, 0.25), atol=1e-9)
-    np.testing.assert_allclose(tests.past_movement["moving"][1], 0.25)
-    steps = np.array(plant.commands[1])[[0, 30], :, 4]  # from rest, and from half the opening
-    np.testing.assert_allclose(steps, [[0, (80 / 127 + 0.07) / 2], [80 / 127] * 2])
+    np.testing.assert_allclose(steps["moving"][1], 0.25)
+    u = np.array(plant.commands[1])[[0, 30], :, 4]  # from rest, and from half the opening
+    np.testing.assert_allclose(u, [[0, (80 / 127 + 0.07) / 2], [80 / 127] * 2])
 
 
 def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
     """And the sweeps go from stop to stop at the paper's speeds."""
-    tests = preliminary.preliminary_tests(BROKK_170, PLANT)
+    sweeps, coupling, steps = preliminary.preliminary_tests(BROKK_170, PLANT).values()
     for command, end, peak in (("u = 80", HIGH, 0.24), ("u = 175", LOW, -0.45)):
-        q, q_dot = tests.sweeps[command]
+        q, q_dot = sweeps[command]
         assert q[-1] == end[4] and q_dot[-1] != 0
         assert np.all(q_dot * peak >= 0)
         assert np.abs(q_dot).max() == pytest.approx(abs(peak), rel=0.04)
         np.testing.assert_allclose(np.diff(q) * 20, q_dot[1:], atol=1e-9)
-    times = {n: preliminary.response_time(*of) for n, of in tests.past_movement.items()}
+    times = {n: preliminary.response_time(*of) for n, of in steps.items()}
     assert times["idle"] == pytest.approx(0.40, abs=0.01)
     assert times["moving"] == pytest.approx(0.105, abs=0.01)
-    alone, together = (q_dot[:40] for _, q_dot in tests.coupling.values())
+    alone, together = (q_dot[:40] for _, q_dot in coupling.values())
     np.testing.assert_allclose(together, alone, atol=0.002)  # "marginal and neglectable"
 
 
@@ -95,6 +96,6 @@ def test_run__of_another_machine():
     machine = replace(MINI_EXCAVATOR, plant_dt=0.02)  # two Euler steps a tick: fast
     net = small_net(machine, np.random.default_rng(0), machine.names)
     tests, gap = preliminary.run(machine, net, 0)
-    assert list(tests) == ["machine", "nets"] and len(tests["nets"].sweeps) == 4
+    assert list(tests) == ["machine", "nets"] and len(tests["nets"]["range and direction"]) == 4
     assert gap.q.shape == (30 * machine.rate, 20, machine.n)
     assert not gap.q[..., machine.locked].any()

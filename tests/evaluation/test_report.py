@@ -9,7 +9,7 @@ from helpers_machines import POSE
 
 from brokk_min._files import SHIPPED, read_json
 from brokk_min.evaluation import metrics, report
-from brokk_min.evaluation.preliminary import Motion, SimulatorTests
+from brokk_min.evaluation.preliminary import Motion
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
@@ -92,13 +92,14 @@ def test_plot_tests__shows_machine_above_nets():
     rows = {}
     for k, kind in enumerate(("machine", "nets"), 1):
         sweeps, coupling = {"u = 50": (x, k * x)}, {"alone": (x, -k * x)}
-        rows[kind] = SimulatorTests(sweeps, coupling, {"from idle": (x, k + x)})
+        rows[kind] = {"sweeps": sweeps, "coupling": coupling, "past movement": {"idle": (x, k + x)}}
     figure = report.plot_tests(BROKK_170, rows)
     *_, past_movement, sweeps, coupling, steps = figure.axes
     assert past_movement.get_title() == "machine: past movement"
+    assert [sweeps.get_xlabel(), steps.get_xlabel()] == ["q5 [rad]", "time after the step [s]"]
     np.testing.assert_array_equal(curves(sweeps)["u = 50"], [x, 2 * x])
     np.testing.assert_array_equal(curves(coupling)["alone"], [x, -2 * x])
-    np.testing.assert_array_equal(curves(steps)["from idle"], [x, 2 + x])
+    np.testing.assert_array_equal(curves(steps)["idle"], [x, 2 + x])
 
 
 def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
