@@ -3,7 +3,6 @@
 import io
 import os
 import sys
-from importlib import import_module
 from typing import Any
 
 # Before NumPy is imported: its BLAS threads, waiting for work, would take the cores from torch's.
@@ -14,45 +13,43 @@ import tyro
 
 from brokk_min import __version__
 from brokk_min._files import brief
+from brokk_min.cli import evaluation, identification, operating, training
+from brokk_min.cli.options import WrongUse, check
 
-COMMANDS = {  # module and class in `cli`, and what the command does
-    "collect": ("identification", "Collect", "record a machine under excitation"),
-    "inspect": ("identification", "Inspect", "what a log tells; with --net, errors of nets on it"),
-    "fit": ("identification", "Fit", "fit nets of each joint to logs, and score them"),
-    "train": ("training", "Train", "train a policy on the nets"),
-    "evaluate": ("evaluation", "Evaluate", "policies and baselines on the same sequences"),
-    "reproduce": ("evaluation", "Reproduce", "the whole chain, the paper's figures, one report"),
-    "sweep": ("training", "Sweep", "train and evaluate many seeds side by side"),
-    "machine": ("operating", "Simulate", "a simulated machine on a CAN bus"),
-    "drive": ("operating", "Drive", "drive a machine on a CAN bus"),
-    "play": ("operating", "Play", "drive with keyboard or gamepad in a window"),
-    "replay": ("operating", "Replay", "make a film of a drive from its log"),
-    "export": ("operating", "Export", "write a policy as ONNX"),
+COMMANDS: dict[str, Any] = {
+    "collect": identification.Collect,
+    "inspect": identification.Inspect,
+    "fit": identification.Fit,
+    "train": training.Train,
+    "evaluate": evaluation.Evaluate,
+    "reproduce": evaluation.Reproduce,
+    "sweep": training.Sweep,
+    "machine": operating.Simulate,
+    "drive": operating.Drive,
+    "play": operating.Play,
+    "replay": operating.Replay,
+    "export": operating.Export,
 }
-LINES = "\n".join(f"  {name:10} {text}" for name, (_, _, text) in COMMANDS.items())
-HELP = f"{__doc__}\n{LINES}\n\n`--version` prints the version."
+
+LINES = "\n".join(f"  {name:10} {command.__doc__}" for name, command in COMMANDS.items())
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; errors are one line on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # an encoding that lacks a sign of ours
-    arguments = sys.argv[1:] if arguments is None else arguments
-    name = arguments[0] if arguments else ""
+    name, *options = (sys.argv[1:] if arguments is None else arguments) or [""]
     if name in ("-h", "--help", "--version"):
-        print(f"brokk_min {__version__}" if name == "--version" else HELP)
+        print(f"brokk_min {__version__}" if name == "--version" else f"{__doc__}\n{LINES}")
         return 0
-    if name not in COMMANDS:
-        print(f"brokk-min: expected one of {', '.join(COMMANDS)}, got {name!r}", file=sys.stderr)
-        return 2
-    module, function, _ = COMMANDS[name]
-    options: Any = {"prog": f"brokk-min {name}", "config": (tyro.conf.FlagCreatePairsOff,)}
     try:
-        command = getattr(import_module(f"brokk_min.cli.{module}"), function)
-        tyro.cli(command, args=arguments[1:], default=command.defaults(arguments), **options)()
+        check(name in COMMANDS, "COMMAND", f"one of {', '.join(COMMANDS)}", repr(name))
+        command, prog = COMMANDS[name], f"brokk-min {name}"
+        default, config = command.defaults(options), (tyro.conf.FlagCreatePairsOff,)
+        tyro.cli(command, prog=prog, args=options, default=default, config=config)()
     except (ValueError, OSError, MemoryError, ImportError) as error:
         print(f"brokk-min: {brief(error, longest=10_000)}", file=sys.stderr)
-        return 2 if type(error).__name__ == "WrongUse" else 1
+        return 2 if isinstance(error, WrongUse) else 1
     except KeyboardInterrupt:
         print("brokk-min: stopped", file=sys.stderr)
         return 1

@@ -38,13 +38,11 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     It has the mode of the file that it replaces. OSError: it cannot be written. ValueError: `path`
     is a folder or a device.
     """
-    path = Path(path)
     require(path.is_file() or not path.exists(), str(path), "a regular file", "another kind")
     target = path.resolve()  # of a link
     temporary = target.with_name(f".{target.name[:100]}.{os.getpid()}")
-    text = {} if "b" in mode else {"newline": "", "encoding": "utf-8"}
     try:
-        with open(temporary, mode, **text) as file:  # type: ignore[call-overload]
+        with open(temporary, mode, encoding=None if "b" in mode else "utf-8") as file:
             with suppress(OSError):  # no file is there yet, or a disk without modes
                 shutil.copymode(target, temporary)
             yield file
@@ -72,9 +70,6 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]])
 
 def brief(value: Any, longest: int = 110) -> str:
     """A value, or what an error says, as text of one line, without the middle of a long one."""
-    if isinstance(value, OSError) and value.strerror:
-        place = f"{value.filename}: " if value.filename else ""
-        return f"{place}{value.strerror.lower()}"
     text = str(value) or type(value).__name__ if isinstance(value, Exception) else repr(value)
     text = " ".join(text.split())
     return text if len(text) <= longest else f"{text[:70]} ... {text[-30:]}"
@@ -114,8 +109,7 @@ def read_json(path: Path, what: str) -> Any:
 
 def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
     """The cells of a CSV by column, see `numbers`; ValueError: no such columns, or a short row."""
-    what = f"a CSV table with columns {', '.join(columns)}" if columns else "a CSV table"
-    with expected(path, what):
+    with expected(path, "a CSV table"):
         with open(path, newline="", encoding="utf-8-sig") as file:
             header, *rows = csv.reader(file, strict=True)
         names = [name.strip() for name in header]
@@ -151,11 +145,11 @@ def load_arrays(path: Path, kind: str = "") -> tuple[dict[str, Any], dict[str, N
 
     ValueError: no readable `.npz`, or not of this `kind`; without a kind it may have no header.
     """
-    with expected(path, f"a readable .npz file of a {kind}" if kind else "a readable .npz file"):
+    with expected(path, "a readable .npz file"):
         with np.load(path, allow_pickle=False) as archive:
             arrays = dict(archive)
         header = json.loads(str(arrays.pop("header", "{}")))
         got = header.pop("kind", None)
-        wanted = f"a file of kind {kind} (if it is older, train or fit again)"
+        wanted = f"{kind} (if it is older: train or fit again)"
         require(kind in ("", got), str(path), wanted, brief(got))
         return header, arrays

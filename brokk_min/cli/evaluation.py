@@ -34,16 +34,14 @@ class Evaluate(Command):
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         path, gains = default_policy(machine, self.policy)
         gains = None if self.save_gains else gains
-        files = {} if self.policy else {k: path.with_name(file) for k, file in POLICIES.items()}
         policies = {"rl": load_policy(path, machine)}
-        policies |= {k: load_policy(file, machine) for k, file in files.items() if file.exists()}
+        if not self.policy:
+            policies |= {k: load_policy(path.with_name(f), machine) for k, f in POLICIES.items()}
         net = policies["rl"].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
         controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
-        task = self.task(machine)
-        runs, _ = metrics.evaluate(machine, controllers, *task, self.seed, plant)
-        if self.starts:
-            runs = [run | {"kind": "file"} for run in runs]
+        runs, _ = metrics.evaluate(machine, controllers, *self.task(machine), self.seed, plant)
+        runs = [run | {"kind": "file"} for run in runs] if self.starts else runs
         if self.json:
             meta = {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
             meta["commands"] = str(self.commands or "own")
@@ -79,12 +77,12 @@ class Evaluate(Command):
 def table(runs: Sequence[metrics.Run]) -> str:
     """Means by controller."""
     num, motions = (len(metrics.column(runs, label)) for label in ("start", "sequence"))
+    row = "{:26}{:>15}" + "{:>15}" * len(metrics.COLUMNS)
     lines = [f"means over {motions} sequences from {num} starts"]
-    heads = ("valves at rest", *metrics.COLUMNS.values())
-    lines.append(f"{'':26}" + "".join(f"{head:>15}" for head in heads))
+    lines.append(row.format("", "valves at rest", *metrics.COLUMNS.values()))
     for name, rows in metrics.means(runs).items():
-        cells = (f"{rows['all'][key]['mean']:15.4g}" for key in metrics.COLUMNS)
-        lines.append(f"{TITLES[name]:26}{valves_at_rest(name):>15}" + "".join(cells))
+        cells = (f"{rows['all'][key]['mean']:.4g}" for key in metrics.COLUMNS)
+        lines.append(row.format(TITLES[name], valves_at_rest(name), *cells))
     return "\n".join(lines)
 
 
@@ -100,8 +98,8 @@ class Reproduce(Command):
         from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce  # loads torch
 
         machine, budget = self.find_machine(), QUICK if self.quick else Budget()
-        if self.out.exists():
-            self.writes(self.out / "results.json", self.out / "report.html")
+        file = self.out / "results.json"
+        check(self.force or not file.exists(), str(file), "no file (or --force)", "one")
         results = reproduce(machine, self.out, budget, self.seed)
         print(table(results["task_space"]["runs"]))
-        print(self.out / "report.html", self.out / "results.json", sep="\n")
+        print(self.out / "report.html", file, sep="\n")

@@ -17,6 +17,7 @@ from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.cli.options import Command, check, check_settings, find_plant
 from brokk_min.identification import columns, excitation, logs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
+from brokk_min.identification.logs import Log
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.machine import BROKK_170, Machine, require
 
@@ -46,37 +47,38 @@ class Collect(Command):
 class ReadsLogs(Command):
     """Options of commands that read logs."""
 
+    logs: Positional[tuple[Path, ...]]  # Of one machine: .csv, .npz, of ROS, or of a CAN bus.
     map: str = ""  # Columns and units, as boom=Boom_ang:deg,u_boom=Lever:percent,time=Zeit:ms.
     topics: tuple[str, str] = columns.TOPICS  # Angles and commands, of ROS.
 
-    def read_logs(self, paths: Sequence[Path]) -> tuple[logs.Log, Machine | None]:
+    def read_logs(self, paths: Sequence[Path]) -> tuple[Log, Machine | None]:
         """One log of tables and drives; the machine if the log has its joints, which it orders.
 
         Locked joints may be missing. ValueError: other joints than those of a machine that is not
         the default one.
         """
         check(len(paths) > 0, "LOGS", "one file or more", "none")
-        machine, mapped = self.find_machine(), columns.parse_map(self.map)
-        found = {}
-        for path in paths:
-            with expected(path, "a log"):
-                if path.is_dir() or path.suffix.lower() in columns.TABLES:
-                    found[path] = logs.read_log(path, machine, mapped, self.topics)
-                else:
-                    require(not mapped, "--map", "a table or a recording of ROS", "a CAN log")
-                    found[path] = log_for_fit(machine, read_frames(path))
-        log = logs.join_logs(found)
+        machine = self.find_machine()
+        log = logs.join_logs({path: self.read_log(path, machine) for path in paths})
         known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
         if machine == BROKK_170 and set(log.joints) != set(known):
             return log, None
         return logs.in_order(log, known), machine
+
+    def read_log(self, path: Path, machine: Machine) -> Log:
+        """A table or a recording of ROS, else a log of a CAN bus."""
+        mapped = columns.parse_map(self.map)
+        if path.is_dir() or path.suffix.lower() in columns.TABLES:
+            return logs.read_log(path, machine, mapped, self.topics)
+        require(not mapped, "--map", "a table or a recording of ROS", path)
+        with expected(path, "a log"):
+            return log_for_fit(machine, read_frames(path))
 
 
 @dataclass(kw_only=True)
 class Inspect(ReadsLogs):
     """What logs tell of their machine, and what they lack; with nets, the errors of these."""
 
-    logs: Positional[tuple[Path, ...]]  # Of one machine: .csv, .npz, of ROS, or of a CAN bus.
     net: Path | None = None  # Also score these nets on the logs.
     json: Path | None = None  # Also write the report here.
 
@@ -88,9 +90,9 @@ class Inspect(ReadsLogs):
         reports = inspection.inspect(log)
         warnings, scores = inspection.warnings(log, reports, known), {}
         if self.net:
-            net, window = load_net(self.net), self.find_machine().velocity_samples
-            wanted, got = f"velocity_samples {window} of --machine", net.velocity_samples
-            require(got == window, str(self.net), wanted, got)
+            net, samples = load_net(self.net), self.find_machine().velocity_samples
+            wanted = f"velocity_samples {samples} of --machine"
+            require(net.velocity_samples == samples, str(self.net), wanted, net.velocity_samples)
             scores = validation.score(net, logs.in_order(log, net.joints))
         if self.json:
             joints = {name: asdict(report) for name, report in reports.items()}
@@ -104,7 +106,6 @@ class Inspect(ReadsLogs):
 class Fit(ReadsLogs):
     """Fit nets of each joint to logs of any machine; score them on other recordings."""
 
-    logs: Positional[tuple[Path, ...]]  # Of one machine: .csv, .npz, of ROS, or of a CAN bus.
     out: Path  # Nets to write, .npz.
     test: tuple[Path, ...] = ()  # Logs to score on; by default every tenth recording of LOGS.
     json: Path | None = None  # Also write the scores here.
@@ -113,43 +114,37 @@ class Fit(ReadsLogs):
     settings: OmitArgPrefixes[FitConfig]
 
     @classmethod
-    def defaults(cls, arguments: list[str]) -> Any:
+    def defaults(cls, options: list[str]) -> Any:
         """Ours, or the settings of the paper's recipe."""
-        recipe, required = PAPER_RECIPE if "--paper" in arguments else {}, tyro.MISSING
-        recipe = recipe | ({"members": 1} if "--no-valve" in arguments else {})
-        return cls(logs=required, out=required, settings=FitConfig(**recipe))
+        settings = FitConfig(**PAPER_RECIPE) if "--paper" in options else FitConfig()
+        return cls(logs=tyro.MISSING, out=tyro.MISSING, settings=settings)
 
     def __call__(self) -> None:
         from brokk_min.identification import fitting, inspection, validation
 
-        machine = self.find_machine()
         check_settings(self.settings)
-        valve, members = self.settings.valve, self.settings.members
-        check(valve or members == 1, "--members", "1 of nets that read the commands", members)
-        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs)
-        test = self.read_logs(self.test)[0] if self.test else None
-        if test is None:
-            log, test = logs.split(log)
+        if self.test:
+            test = logs.in_order(self.read_logs(self.test)[0], log.joints)
         else:
-            with expected(self.test[0], "a log of the same joints"):
-                test = logs.in_order(test, log.joints)
+            log, test = logs.split(log)
         reports = inspection.inspect(log)
         for wrong in inspection.wrong_signs(reports):
-            raise ValueError(f"{self.logs[0]}: {wrong}")
-        net = fitting.fit(log, self.settings, self.seed, machine, known.name if known else "")
+            raise ValueError(wrong)
+        name = known.name if known else ""
+        net = fitting.fit(log, self.settings, self.seed, self.find_machine(), name)
         scores = validation.score(net, test)
         warnings = validation.warnings(scores) + inspection.warnings(log, reports, known)
         save_net(self.out, net)
         if self.json:
             files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
-            of_net = {"machine": net.machine, "rate": net.rate, "history": net.history}
+            of_net = {"machine": name, "rate": net.rate, "history": net.history}
             meta = {**files, **of_net, **net.training}
             write_json(self.json, {"meta": meta, "joints": scores, "warnings": warnings})
         tried = brief([recording.name for recording in test.recordings])
-        print(f"{self.out}: nets of {net.machine or 'an unknown machine'}, scored on {tried}")
+        print(f"{self.out}: nets of {name or 'an unknown machine'}, scored on {tried}")
         print_scores(scores, warnings)
 
 

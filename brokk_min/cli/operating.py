@@ -32,9 +32,8 @@ class Simulate(Command):
 
     def __call__(self) -> None:
         machine = self.find_machine()
-        plant = find_plant(self.plant, machine)
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
-        simulate(machine, self.interface, self.channel, plant)
+        simulate(machine, self.interface, self.channel, find_plant(self.plant, machine))
 
 
 @dataclass(kw_only=True)
@@ -57,7 +56,6 @@ class Drive(Command):
     def __call__(self) -> None:
         machine = self.find_machine()
         self.writes(self.log)
-        check(self.shadow or not self.sync, "--sync", "--shadow with it", "a drive that sends SYNC")
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         with open_bus(self.interface, self.channel, self.log) as bus:
             if self.shadow or operator is None:
@@ -73,15 +71,15 @@ class Drive(Command):
 
     def find_controller(self, machine: Machine) -> Controller:
         """The controller that is named."""
-        if self.controller == "jog":
-            driven = [machine.names[i] for i in machine.driven]
-            check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
-            return JointJog(machine, self.joint, self.counts)
-        return find_controller(machine, self.policy, self.controller == "rl")
+        if self.controller != "jog":
+            return find_controller(machine, self.policy, self.controller == "rl")
+        driven = [machine.names[i] for i in machine.driven]
+        check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
+        return JointJog(machine, self.joint, self.counts)
 
     def find_operator(self, machine: Machine) -> Joystick | Script | None:
         """The joystick, or the script of a file; a shadow needs none."""
-        if not self.command and self.shadow:
+        if self.shadow and not self.command:
             return None
         if self.command in ("", "joystick"):
             return Joystick(machine, self.axes, self.button)
@@ -95,28 +93,29 @@ def find_controller(machine: Machine, policy: Path | None, rl: bool) -> Controll
     found = load_policy(path, machine)
     if rl:
         return found
-    print(f"gains of the Jacobian controller: {gains or 'set by hand'}")
-    known = read_gains(gains, machine, found.net) if gains else baselines(machine, found.net)
-    return known[OPTIMISED]
+    print(f"gains of the PID: {gains or 'set by hand'}")
+    pids = read_gains(gains, machine, found.net) if gains else baselines(machine, found.net)
+    return pids[OPTIMISED]
 
 
 def status(drive: hw.Drive) -> str:
     """One line: state, faults, goal and measured tool velocity [m/s], angles [rad], lateness."""
-    active = str(drive.gate.active_fault)
-    words = ["driving" if drive.gate.driving else "waiting" if active else "ready", drive.reason]
-    words += [f"now {active}"] if active not in drive.reason else []  # what is in the way
-    vectors: dict[str, Any] = {"v goal": drive.operator_input.v_goal}
-    if not drive.gate.driving and isinstance(drive.operator, Joystick):
-        axes = [str(axis) for axis, v in zip(drive.operator.axes, drive.operator_input.v_goal) if v]
-        words += ["the stick is not centred: axis " + " and ".join(axes)] if axes else []
+    driving, v_goal = drive.gate.driving, drive.operator_input.v_goal
+    active = fault_name(drive.machine, int(drive.gate.active_fault))
+    words = ["driving" if driving else "waiting" if active else "ready", drive.reason]
+    if active not in drive.reason:
+        words.append(f"now {active}")  # what is in the way
+    if isinstance(drive.operator, Joystick) and any(v_goal) and not driving:
+        axes = [axis for axis, v in zip(drive.operator.axes, v_goal) if v]
+        words.append(f"the stick is not centred: axis {axes}")
+    vectors: dict[str, Any] = {"v goal": v_goal}
     if measured := drive.measured:
         vectors |= {"measured": measured.v_tool[0], "q": measured.q[0]}
     if isinstance(drive, Shadow) and drive.pairs:
         would_send, sent = drive.pairs[-1]
         vectors |= {"would send": would_send / PWM_MAX, "sent": sent / PWM_MAX}
     words += [f"{name} {' '.join(f'{x:+z.2f}' for x in row)}" for name, row in vectors.items()]
-    words += [f"late {1e3 * drive.lateness:.1f} ms"]
-    return ", ".join(filter(None, words))
+    return ", ".join(filter(None, [*words, f"late {1e3 * drive.lateness:.1f} ms"]))
 
 
 @dataclass(kw_only=True)

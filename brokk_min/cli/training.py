@@ -26,23 +26,21 @@ class Training(Command):
     task: OmitArgPrefixes[TaskConfig]
 
     @classmethod
-    def defaults(cls, arguments: list[str]) -> Any:
-        """The settings of the agent that the arguments name."""
-        recipe = find_recipe("--paper" in arguments, "--critic" in arguments)
+    def defaults(cls, options: list[str]) -> Any:
+        """The settings of the agent that the options name."""
+        recipe = find_recipe("--paper" in options, "--critic" in options)
         required: Any = tyro.MISSING
         return cls(actuator=required, out=required, learner=recipe.learner, task=recipe.task)
 
     def recipe(self) -> Recipe:
-        """The agent and its learner."""
-        check(self.seed >= 0, "--seed", "0 or more", self.seed)
+        """The agent, its learner and its task."""
         learner, task = self.learner, self.task
         check_settings(learner)
         check_settings(task)
         check(learner.gamma < 1, "--gamma", "below 1", learner.gamma)
-        fits = task.hold_min_s <= task.hold_max_s
-        check(fits, "--hold-max-s", f"{task.hold_min_s} or more", task.hold_max_s)
-        recipe = find_recipe(self.paper, self.critic)
-        return replace(recipe, task=task, learner=learner)
+        shortest, longest = task.hold_min_s, task.hold_max_s
+        check(shortest <= longest, "--hold-max-s", f"{shortest} or more", longest)
+        return replace(find_recipe(self.paper, self.critic), task=task, learner=learner)
 
 
 @dataclass(kw_only=True)
@@ -55,12 +53,10 @@ class Train(Training):
         from brokk_min.learning.checkpoint import train_policy
 
         machine, recipe = self.find_machine(), self.recipe()
-        checkpoint = Path(f"{self.out}.checkpoint")
         self.writes(self.out)
-        fits = self.resume or not checkpoint.exists()
-        check(fits, str(checkpoint), "--resume or no checkpoint", "one of a broken training")
-        net = load_net(self.actuator, machine)
-        train_policy(machine, net, recipe, self.seed, self.out)
+        fits = self.resume or not Path(f"{self.out}.checkpoint").exists()
+        check(fits, f"{self.out}.checkpoint", "--resume or no checkpoint", "one")
+        train_policy(machine, load_net(self.actuator, machine), recipe, self.seed, self.out)
         print(f"{self.out}: trained; curve in {self.out}.csv")
 
 

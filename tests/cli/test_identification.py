@@ -66,7 +66,7 @@ def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys)
     log = foreign_log(tmp_path / "log.csv", 0, 2, sign=-1)
     assert run(f"fit {TINY}", log, "--out", tmp_path / "n.npz") == 1
     reversed_one = "u_arm: expected positive commands to raise q_arm"
-    assert f"log.csv: {reversed_one}" in capsys.readouterr().err
+    assert reversed_one in capsys.readouterr().err
     assert not (tmp_path / "n.npz").exists()
     assert run("inspect", log) == 0
     assert f"warning: {reversed_one}" in capsys.readouterr().out
