@@ -44,9 +44,10 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     try:
         check(name in COMMANDS, "COMMAND", f"one of {', '.join(COMMANDS)}", repr(name))
-        command, prog = COMMANDS[name], f"brokk-min {name}"
-        default, config = command.defaults(options), (tyro.conf.FlagCreatePairsOff,)
-        tyro.cli(command, prog=prog, args=options, default=default, config=config)()
+        kind, prog = COMMANDS[name], f"brokk-min {name}"
+        default, config = kind.defaults(options), (tyro.conf.FlagCreatePairsOff,)
+        command = tyro.cli(kind, prog=prog, args=options, default=default, config=config)
+        command(command.find_machine())
     except (ValueError, OSError, MemoryError, ImportError) as error:
         print(f"brokk-min: {brief(error, longest=10_000)}", file=sys.stderr)
         return 2 if isinstance(error, WrongUse) else 1

@@ -35,8 +35,7 @@ def require_package(package: str, extra: str) -> Any:
 def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """A temporary file, text in UTF-8, that replaces `path` if the block ends without an error.
 
-    It has the mode of the file that it replaces. OSError: it cannot be written. ValueError: `path`
-    is a folder or a device.
+    It has the mode of the file that it replaces. ValueError: `path` is a folder or a device.
     """
     require(path.is_file() or not path.exists(), str(path), "a regular file", "another kind")
     target = path.resolve()  # of a link
@@ -70,7 +69,7 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]])
 
 def brief(value: Any, longest: int = 110) -> str:
     """A value, or what an error says, as text of one line, without the middle of a long one."""
-    text = str(value) or type(value).__name__ if isinstance(value, Exception) else repr(value)
+    text = str(value) if isinstance(value, Exception) and str(value) else repr(value)
     text = " ".join(text.split())
     return text if len(text) <= longest else f"{text[:70]} ... {text[-30:]}"
 
@@ -79,17 +78,17 @@ def brief(value: Any, longest: int = 110) -> str:
 def expected(path: Path, what: str) -> Iterator[None]:
     """Turn any error of the block into a ValueError: `path` is not `what`.
 
-    Errors of the operating system and of memory stay as they are. A ValueError that says what was
-    expected only gets `path` in front of it, if it is not there yet.
+    OSError and MemoryError stay as they are. One that says what was expected only gets `path` in
+    front of it.
     """
     try:
         yield
     except (OSError, MemoryError):
         raise
     except Exception as error:  # zipfile, zlib, json and NumPy raise anything on damaged files
-        told = isinstance(error, ValueError) and ": expected " in str(error)
-        if told and str(error).startswith(f"{path}: "):
+        if str(error).startswith(f"{path}: "):
             raise
+        told = ": expected " in str(error)
         reason = error if told else f"expected {what}, got {brief(error)}"
         raise ValueError(f"{path}: {reason}") from error
 

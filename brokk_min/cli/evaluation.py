@@ -28,8 +28,7 @@ class Evaluate(Command):
     num_starts: int = 16  # Without --starts: how many of the machine's.
     seed: int = 0  # Of the noise, and of what is drawn and tuned.
 
-    def __call__(self) -> None:
-        machine = self.find_machine()
+    def __call__(self, machine: Machine) -> None:
         self.writes(self.json, self.save_gains)
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         path, gains = default_policy(machine, self.policy)
@@ -94,10 +93,10 @@ class Reproduce(Command):
     quick: bool = False  # The same, smaller: to see that it runs, not to assess the policy.
     seed: int = 0  # Of everything that is random.
 
-    def __call__(self) -> None:
+    def __call__(self, machine: Machine) -> None:
         from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce  # loads torch
 
-        machine, budget = self.find_machine(), QUICK if self.quick else Budget()
+        budget = QUICK if self.quick else Budget()
         file = self.out / "results.json"
         check(self.force or not file.exists(), str(file), "no file (or --force)", "one")
         results = reproduce(machine, self.out, budget, self.seed)

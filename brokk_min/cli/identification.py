@@ -4,7 +4,7 @@ What fits or searches is imported by the command that runs it, because help must
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,8 +32,7 @@ class Collect(Command):
     plant: str = "analytic"  # What moves: the analytic plant, or FILE.py:NAME.
     seed: int = 0  # Of the commands.
 
-    def __call__(self) -> None:
-        machine = self.find_machine()
+    def __call__(self, machine: Machine) -> None:
         check(self.out.suffix in (".csv", ".npz"), "--out", "a name in .csv or .npz", self.out)
         check(0 < self.hours <= 100, "--hours", "above 0, to 100", self.hours)
         self.writes(self.out)
@@ -51,14 +50,12 @@ class ReadsLogs(Command):
     map: str = ""  # Columns and units, as boom=Boom_ang:deg,u_boom=Lever:percent,time=Zeit:ms.
     topics: tuple[str, str] = columns.TOPICS  # Angles and commands, of ROS.
 
-    def read_logs(self, paths: Sequence[Path]) -> tuple[Log, Machine | None]:
-        """One log of tables and drives; the machine if the log has its joints, which it orders.
+    def read_logs(self, paths: Sequence[Path], machine: Machine) -> tuple[Log, Machine | None]:
+        """One log of several; and the machine, but not the default one if the joints are others.
 
-        Locked joints may be missing. ValueError: other joints than those of a machine that is not
-        the default one.
+        The joints are in the order of the machine, of which locked ones may be missing.
         """
         check(len(paths) > 0, "LOGS", "one file or more", "none")
-        machine = self.find_machine()
         log = logs.join_logs({path: self.read_log(path, machine) for path in paths})
         known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
         if machine == BROKK_170 and set(log.joints) != set(known):
@@ -80,25 +77,17 @@ class Inspect(ReadsLogs):
     """What logs tell of their machine, and what they lack; with nets, the errors of these."""
 
     net: Path | None = None  # Also score these nets on the logs.
-    json: Path | None = None  # Also write the report here.
 
-    def __call__(self) -> None:
+    def __call__(self, machine: Machine) -> None:
         from brokk_min.identification import inspection, validation
 
-        self.writes(self.json)
-        log, known = self.read_logs(self.logs)
+        log, known = self.read_logs(self.logs, machine)
         reports = inspection.inspect(log)
         warnings, scores = inspection.warnings(log, reports, known), {}
         if self.net:
-            net, samples = load_net(self.net), self.find_machine().velocity_samples
-            wanted = f"velocity_samples {samples} of --machine"
-            require(net.velocity_samples == samples, str(self.net), wanted, net.velocity_samples)
+            net = load_net(self.net)
             scores = validation.score(net, logs.in_order(log, net.joints))
-        if self.json:
-            joints = {name: asdict(report) for name, report in reports.items()}
-            write_json(self.json, {"joints": joints, "scores": scores, "warnings": warnings})
-        print(f"{len(log.recordings)} recordings")
-        print("\n".join(inspection.table(reports)))
+        print(f"{len(log.recordings)} recordings", *inspection.table(reports), sep="\n")
         print_scores(scores, warnings)
 
 
@@ -119,22 +108,22 @@ class Fit(ReadsLogs):
         settings = FitConfig(**PAPER_RECIPE) if "--paper" in options else FitConfig()
         return cls(logs=tyro.MISSING, out=tyro.MISSING, settings=settings)
 
-    def __call__(self) -> None:
+    def __call__(self, machine: Machine) -> None:
         from brokk_min.identification import fitting, inspection, validation
 
         check_settings(self.settings)
         check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
         self.writes(self.out, self.json)
-        log, known = self.read_logs(self.logs)
+        log, known = self.read_logs(self.logs, machine)
         if self.test:
-            test = logs.in_order(self.read_logs(self.test)[0], log.joints)
+            test = logs.in_order(self.read_logs(self.test, machine)[0], log.joints)
         else:
             log, test = logs.split(log)
         reports = inspection.inspect(log)
         for wrong in inspection.wrong_signs(reports):
             raise ValueError(wrong)
         name = known.name if known else ""
-        net = fitting.fit(log, self.settings, self.seed, self.find_machine(), name)
+        net = fitting.fit(log, self.settings, self.seed, machine, name)
         scores = validation.score(net, test)
         warnings = validation.warnings(scores) + inspection.warnings(log, reports, known)
         save_net(self.out, net)

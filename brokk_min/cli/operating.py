@@ -30,8 +30,7 @@ class Simulate(Command):
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
     plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped every `plant_dt`.
 
-    def __call__(self) -> None:
-        machine = self.find_machine()
+    def __call__(self, machine: Machine) -> None:
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
         simulate(machine, self.interface, self.channel, find_plant(self.plant, machine))
 
@@ -53,8 +52,7 @@ class Drive(Command):
     button: int = 5  # Button of the joystick that must be held.
     log: Path | None = None  # Also log every frame here, candump format.
 
-    def __call__(self) -> None:
-        machine = self.find_machine()
+    def __call__(self, machine: Machine) -> None:
         self.writes(self.log)
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         with open_bus(self.interface, self.channel, self.log) as bus:
@@ -125,10 +123,9 @@ class Play(Command):
     policy: Path | None = None  # Policy that `train` wrote, with gains.json beside it.
     plant: str = "analytic"  # What moves, or FILE.py:NAME.
 
-    def __call__(self) -> None:
+    def __call__(self, machine: Machine) -> None:
         from brokk_min.viewer.play import play
 
-        machine = self.find_machine()
         controllers = {
             TITLES["rl"]: find_controller(machine, self.policy, rl=True),
             TITLES[OPTIMISED]: find_controller(machine, self.policy, rl=False),
@@ -143,10 +140,9 @@ class Replay(Command):
     log: Positional[Path]  # That `drive --log` wrote.
     out: Path  # File to write, .gif.
 
-    def __call__(self) -> None:
+    def __call__(self, machine: Machine) -> None:
         from brokk_min.viewer.replay import film
 
-        machine = self.find_machine()
         self.writes(self.out)
         check(self.out.suffix == ".gif", "--out", "a name in .gif", self.out)
         film(self.log, machine, self.out)
@@ -159,10 +155,9 @@ class Export(Command):
     policy: Path  # Policy that `train` wrote.
     out: Path  # File to write, .onnx.
 
-    def __call__(self) -> None:
+    def __call__(self, machine: Machine) -> None:
         from brokk_min.learning.onnx import export_onnx
 
-        machine = self.find_machine()
         self.writes(self.out)
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # not on what is not needed here
         warnings.filterwarnings("ignore", category=FutureWarning, module="copyreg")  # torch's own

@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes
 from brokk_min.cli.options import Command, check, check_settings
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.recipes import Recipe, find_recipe
+from brokk_min.machine import Machine
 from brokk_min.settings import PPOConfig, TaskConfig
 
 
@@ -49,10 +50,10 @@ class Train(Training):
 
     resume: bool = False  # Go on from OUT.checkpoint; the end is the same as without the break.
 
-    def __call__(self) -> None:
+    def __call__(self, machine: Machine) -> None:
         from brokk_min.learning.checkpoint import train_policy
 
-        machine, recipe = self.find_machine(), self.recipe()
+        recipe = self.recipe()
         self.writes(self.out)
         fits = self.resume or not Path(f"{self.out}.checkpoint").exists()
         check(fits, f"{self.out}.checkpoint", "--resume or no checkpoint", "one")
@@ -68,11 +69,11 @@ class Sweep(Training):
     scheduler: str | None = None  # tcp://... of dask; its workers must see OUT. None: this machine.
     num_starts: int = 16  # Start poses for each scored sequence.
 
-    def __call__(self) -> None:
+    def __call__(self, machine: Machine) -> None:
         from brokk_min.evaluation.metrics import COLUMNS, interval_text
         from brokk_min.evaluation.sweep import sweep
 
-        machine, recipe = self.find_machine(), self.recipe()
+        recipe = self.recipe()
         check(self.seeds > 0, "--seeds", "1 or more", self.seeds)
         seeds = range(self.seed, self.seed + self.seeds)
         net = load_net(self.actuator, machine)

@@ -54,12 +54,13 @@ def test_fit__takes_a_foreign_log_and_beats_persistence(tmp_path, capsys):
     assert (meta["machine"], meta["logs"], meta["test"]) == ("", [str(log)], [str(test)])
     for joint in written["joints"].values():
         assert joint["one_step_rmse"] < joint["persistence_rmse"]
-    assert run("inspect", test, "--net", tmp_path / "n.npz", "--json", tmp_path / "i.json") == 0
-    report = json.loads((tmp_path / "i.json").read_text())
-    assert report["scores"] == written["joints"]
-    for joint in report["joints"].values():
-        assert joint["dead_zone"] == pytest.approx([0.3, 0.3], abs=0.03)
-    assert "warning: boom: expected 10 minutes, got 0.8" in capsys.readouterr().out
+    scores = re.findall(r"^(?:boom|arm): .* 5 s .*$", capsys.readouterr().out, re.M)
+    assert run("inspect", test, "--net", tmp_path / "n.npz") == 0
+    printed = capsys.readouterr().out
+    assert len(scores) == 2 and all(line in printed for line in scores)
+    zones = re.findall(r"dead_zone=\((0\.\d+), (0\.\d+)\)", printed)
+    assert np.array(zones, float) == pytest.approx(np.full((2, 2), 0.3), abs=0.03)
+    assert "warning: boom: expected 10 minutes, got 0.8" in printed
 
 
 def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys):
@@ -95,10 +96,7 @@ def test_fit__knows_the_machine_of_a_log_and_the_papers_recipe(tmp_path, capsys)
     )
     assert run(f"fit --force {TINY} --rollout 1 --machine {slow}:SLOW", own, "--out", out) == 0
     net = load_net(out)
-    expected = ("slow", 10.0, 3, 6)
-    assert (net.machine, net.rate, net.velocity_samples, net.history) == expected
-    assert run("inspect --net", out, own) == 1  # as a log of the default machine
-    assert "n.npz: expected velocity_samples 4 of --machine, got 3" in capsys.readouterr().err
+    assert (net.machine, net.rate, net.velocity_samples, net.history) == ("slow", 10.0, 3, 6)
 
 
 def test_collect__records_what_read_log_reads(tmp_path):

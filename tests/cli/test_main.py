@@ -1,6 +1,5 @@
 """The command line as a user meets it: help, version, refusals in one line, exit statuses."""
 
-import json
 import os
 import subprocess
 import sys
@@ -53,14 +52,13 @@ def test_files__are_utf_8_in_any_locale(tmp_path):
     """Written and read with names of joints that the locale cannot write."""
     (tmp_path / "names.py").write_text(GERMAN, encoding="utf-8")
     locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    for line in ("collect --out g.csv --hours 0.001", "inspect g.csv --json g.json"):
+    for line in ("collect --out g.csv --hours 0.001", "inspect g.csv"):
         words = [*line.split(), "--machine", "names.py:GERMAN"]
         command = [sys.executable, "-c", f"from brokk_min.__main__ import main; main({words})"]
         environment = os.environ | locale | {"PYTHONPATH": str(ROOT)}
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True)
         assert (done.returncode, done.stderr) == (0, b"") and b"L?ffel" in done.stdout
     assert "q_Löffel" in (tmp_path / "g.csv").read_text(encoding="utf-8")
-    assert "Löffel" in json.loads((tmp_path / "g.json").read_text(encoding="utf-8"))["joints"]
 
 
 def test_version__is_that_of_the_project_and_of_its_citation(capsys):
