@@ -15,34 +15,30 @@ from unittest import mock
 import jupytext
 import matplotlib
 import numpy as np
-import pytest
 
 matplotlib.use("Agg")
 PAGE = Path(__file__).parents[2] / "docs" / "walkthrough.md"
 FIGURES = PAGE.parent / "figures"
 BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:^```\n(.*?)^```\n)?", re.M | re.S)
 SVG = {"svg.hashsalt": "walkthrough", "svg.fonttype": "none"}  # the same bytes, letters as text
-Ran = tuple[list[str], dict[str, str]]  # what blocks print, and files that they write by name
 CURVE = re.compile(r'<path d="([^"]+)" clip-path="[^"]+" style="fill: none')
 
 
-def run(codes: list[str]) -> Ran:
-    """What the blocks print, one after the other in one interpreter, and the files they write."""
+def render() -> tuple[str, dict[str, str]]:
+    """The page, its blocks run one after the other in one interpreter; files that they write."""
     namespace: dict[str, object] = {}
-    printed = []
+
+    def with_output(block: re.Match[str]) -> str:
+        with redirect_stdout(io.StringIO()) as output:
+            exec(compile(block[1], str(PAGE), "exec"), namespace)
+        printed = output.getvalue()
+        return f"```python\n{block[1]}```\n" + (f"```\n{printed}```\n" if printed else "")
+
     no_date = mock.patch.dict(os.environ, SOURCE_DATE_EPOCH="0")
     with tempfile.TemporaryDirectory() as folder, chdir(folder), no_date:
         with matplotlib.rc_context(SVG):
-            for code in codes:
-                with redirect_stdout(io.StringIO()) as output:
-                    exec(compile(code, str(PAGE), "exec"), namespace)
-                printed.append(output.getvalue())
-        return printed, {path.name: path.read_text() for path in Path(folder).iterdir()}
-
-
-@pytest.fixture(scope="module")
-def ran() -> Ran:
-    return run([code for code, _ in BLOCK.findall(PAGE.read_text())])
+            page = BLOCK.sub(with_output, PAGE.read_text())
+        return page, {path.name: path.read_text() for path in Path(folder).iterdir()}
 
 
 def corners(figure: str) -> list[list[float]]:
@@ -54,15 +50,11 @@ def corners(figure: str) -> list[list[float]]:
     return result
 
 
-def test_blocks__print_what_stands_below(ran: Ran) -> None:
-    below = [output for _, output in BLOCK.findall(PAGE.read_text())]
-    assert ran[0] == below, "run `make docs`"
-
-
-def test_figures__are_those_of_the_blocks(ran: Ran) -> None:
-    shown = re.findall(r"^!\[.{30,}\]\(figures/(.*?)\)$", PAGE.read_text(), re.M)
-    assert sorted(ran[1]) == sorted(shown)
-    for name, figure in ran[1].items():
+def test_page__has_what_its_blocks_print_and_draw() -> None:
+    page, figures = render()
+    assert PAGE.read_text() == page, "run `make docs`"
+    assert sorted(figures) == sorted(re.findall(r"^!\[.{30,}\]\(figures/(.*?)\)$", page, re.M))
+    for name, figure in figures.items():
         wanted, got = corners(figure), corners((FIGURES / name).read_text())
         assert len(wanted) >= 2
         np.testing.assert_allclose(got, wanted, atol=2, err_msg=f"{name}: run `make docs`")
@@ -84,15 +76,8 @@ def notebook() -> str:
 
 def write() -> None:
     """Put what the blocks print below them, and what they draw into figures/."""
-    printed, figures = run([code for code, _ in BLOCK.findall(PAGE.read_text())])
-    outputs = iter(printed)
-
-    def with_output(match: re.Match[str]) -> str:
-        output = next(outputs)
-        return f"```python\n{match[1]}```\n" + (f"```\n{output}```\n" if output else "")
-
-    PAGE.write_text(BLOCK.sub(with_output, PAGE.read_text()))
-    FIGURES.mkdir(exist_ok=True)
+    page, figures = render()
+    PAGE.write_text(page)
     for name, figure in figures.items():
         (FIGURES / name).write_text(figure)
     PAGE.with_suffix(".ipynb").write_text(notebook())
