@@ -4,12 +4,11 @@ What fits or searches is imported by the command that runs it, because help must
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
 from brokk_min._files import brief, expected, write_json
@@ -102,17 +101,11 @@ class Fit(ReadsLogs):
     seed: int = 0  # Of the weights and the drawn windows.
     settings: OmitArgPrefixes[FitConfig]
 
-    @classmethod
-    def defaults(cls, options: list[str]) -> Any:
-        """Ours, or the settings of the paper's recipe."""
-        settings = FitConfig(**PAPER_RECIPE) if "--paper" in options else FitConfig()
-        return cls(logs=tyro.MISSING, out=tyro.MISSING, settings=settings)
-
     def __call__(self, machine: Machine) -> None:
         from brokk_min.identification import fitting, inspection, validation
 
         check_settings(self.settings)
-        check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
+        settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs, machine)
         if self.test:
@@ -123,7 +116,7 @@ class Fit(ReadsLogs):
         for wrong in inspection.wrong_signs(reports):
             raise ValueError(wrong)
         name = known.name if known else ""
-        net = fitting.fit(log, self.settings, self.seed, machine, name)
+        net = fitting.fit(log, settings, self.seed, machine, name)
         scores = validation.score(net, test)
         warnings = validation.warnings(scores) + inspection.warnings(log, reports, known)
         save_net(self.out, net)

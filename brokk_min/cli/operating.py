@@ -144,7 +144,6 @@ class Replay(Command):
         from brokk_min.viewer.replay import film
 
         self.writes(self.out)
-        check(self.out.suffix == ".gif", "--out", "a name in .gif", self.out)
         film(self.log, machine, self.out)
 
 

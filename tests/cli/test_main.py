@@ -102,7 +102,6 @@ VIRTUAL = "drive --interface virtual --channel v"
         ("machine --interface nonsense --channel 0", 1, "nonsense 0: expected a CAN bus, got"),
         (f"{VIRTUAL} --controller jog --joint q2", 2, "--joint: expected one of ['q1', 'q3',"),
         (f"{VIRTUAL} --controller jog --joint q1", 1, "joystick: expected one, or --command FILE"),
-        ("replay run.log --out a.mp4", 2, "--out: expected a name in .gif, got a.mp4"),
     ],
 )
 def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):
