@@ -2,23 +2,17 @@
 
 from helpers_bus import BASELINE, HoldingOperator, Virtual, World, only
 
-from brokk_min.can.operator_input import JointJog, Joystick
-from brokk_min.cli.operating import Drive, status
+from brokk_min.can.operator_input import Joystick
+from brokk_min.cli.operating import find_controller, status
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import BROKK_170
 
 
-def test_drive__has_the_controller_that_is_named(folder):
-    where = {"interface": "virtual", "channel": "v", "policy": folder / "policy.npz"}
-    controllers = {
-        name: Drive(**where, controller=name, joint="q1").find_controller(BROKK_170)
-        for name in ("rl", "jacobian", "jog")
-    }
-    assert isinstance(controllers["rl"], Policy)
-    assert controllers["jog"] == JointJog(BROKK_170, "q1", 12)
-    assert (controllers["jacobian"].gains.ki == 8.0).all() and controllers["jacobian"].k == 0.1
+def test_find_controller__is_the_policy_or_the_pid_with_the_gains_beside_it(folder):
+    pid = find_controller(BROKK_170, folder / "policy.npz", rl=False)
+    assert (pid.gains.ki == 8.0).all() and pid.k == 0.1
     (folder / "gains.json").write_text("of other nets")  # which the policy does not need
-    assert Drive(**where).find_controller(BROKK_170) is not None
+    assert isinstance(find_controller(BROKK_170, folder / "policy.npz", rl=True), Policy)
 
 
 def test_status__says_what_stopped_it_and_what_is_in_the_way():
