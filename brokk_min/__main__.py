@@ -30,7 +30,6 @@ COMMANDS: dict[str, Any] = {
     "replay": operating.Replay,
     "export": operating.Export,
 }
-
 LINES = "\n".join(f"  {name:10} {command.__doc__}" for name, command in COMMANDS.items())
 
 
@@ -44,9 +43,13 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     try:
         check(name in COMMANDS, "COMMAND", f"one of {', '.join(COMMANDS)}", repr(name))
-        kind, prog = COMMANDS[name], f"brokk-min {name}"
-        default, config = kind.defaults(options), (tyro.conf.FlagCreatePairsOff,)
-        command = tyro.cli(kind, prog=prog, args=options, default=default, config=config)
+        command = tyro.cli(
+            COMMANDS[name],
+            prog=f"brokk-min {name}",
+            args=options,
+            default=COMMANDS[name].defaults(options),
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
         command(command.find_machine())
     except (ValueError, OSError, MemoryError, ImportError) as error:
         print(f"brokk-min: {brief(error, longest=10_000)}", file=sys.stderr)

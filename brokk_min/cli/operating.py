@@ -77,10 +77,9 @@ class Drive(Command):
 
     def find_operator(self, machine: Machine) -> Joystick | Script | None:
         """The joystick, or the script of a file; a shadow needs none."""
-        if self.shadow and not self.command:
-            return None
         if self.command in ("", "joystick"):
-            return Joystick(machine, self.axes, self.button)
+            alone = self.shadow and not self.command
+            return None if alone else Joystick(machine, self.axes, self.button)
         goals = [sequence.goals for sequence in read_commands(Path(self.command), machine)]
         return Script(machine, np.concatenate(goals))
 

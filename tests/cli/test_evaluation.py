@@ -7,6 +7,8 @@ from helpers_cli import run
 from helpers_machines import obedient_net, pids
 
 from brokk_min.evaluation import baselines
+from brokk_min.evaluation.rollout import TITLES
+from brokk_min.learning.policy import POLICIES
 from brokk_min.machine import BROKK_170
 
 NET = obedient_net(BROKK_170)
@@ -57,10 +59,11 @@ def test_evaluate__tunes_pids_anew_and_again_by_what_the_file_says(folder, capsy
     assert again["runs"] == first["runs"]
 
 
-def test_evaluate__begins_at_poses_of_the_package(folder, capsys):
-    files = f"--policy {folder}/policy.npz --commands {folder}/c.csv"
-    assert run(f"evaluate {files} --num-starts 3") == 0
-    assert "means over 1 sequences from 3 starts" in capsys.readouterr().out
+def test_evaluate__has_policies_and_poses_of_the_package(folder, capsys):
+    assert run(f"evaluate --commands {folder}/c.csv --num-starts 3") == 0
+    printed = capsys.readouterr().out
+    assert "means over 1 sequences from 3 starts" in printed
+    assert all(f"\n{TITLES[name]}" in printed for name in POLICIES)
 
 
 def test_reproduce__does_not_write_over_results(tmp_path, capsys):
