@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
-from brokk_min._files import brief, expected, write_json
+from brokk_min._files import expected, write_json
 from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.cli.options import Command, check, check_settings, find_plant
 from brokk_min.identification import columns, excitation, logs
@@ -121,12 +121,11 @@ class Fit(ReadsLogs):
         warnings = validation.warnings(scores) + inspection.warnings(log, reports, known)
         save_net(self.out, net)
         if self.json:
-            files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
-            of_net = {"machine": name, "rate": net.rate, "history": net.history}
-            meta = {**files, **of_net, **net.training}
+            meta: dict[str, Any] = {"machine": name, "rate": net.rate, "history": net.history}
+            meta |= {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
+            meta |= net.training
             write_json(self.json, {"meta": meta, "joints": scores, "warnings": warnings})
-        tried = brief([recording.name for recording in test.recordings])
-        print(f"{self.out}: nets of {name or 'an unknown machine'}, scored on {tried}")
+        print(f"{self.out}: nets of {name or 'an unknown machine'}")
         print_scores(scores, warnings)
 
 
