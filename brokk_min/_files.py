@@ -69,6 +69,9 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]])
 
 def brief(value: Any, longest: int = 110) -> str:
     """A value, or what an error says, as text of one line, without the middle of a long one."""
+    if isinstance(value, OSError) and value.strerror:
+        place = f"{value.filename}: " if value.filename else ""
+        return f"{place}{value.strerror.lower()}"
     text = str(value) if isinstance(value, Exception) and str(value) else repr(value)
     text = " ".join(text.split())
     return text if len(text) <= longest else f"{text[:70]} ... {text[-30:]}"

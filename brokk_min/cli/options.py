@@ -67,7 +67,8 @@ class Command:
 def load_object(option: str, name: str) -> Any:
     """The object NAME of `FILE.py:NAME`; the file is run, as `python FILE.py` would."""
     path, _, symbol = name.rpartition(":")
-    check(path.endswith(".py"), option, "a known name or FILE.py:NAME", name)
+    known = "analytic" if option == "--plant" else BROKK_170.name
+    check(path.endswith(".py"), option, f"{known} or FILE.py:NAME", name)
     sys.path.insert(0, str(Path(path).resolve().parent))  # files beside it can be imported
     with expected(Path(path), "a file that runs"):
         found = runpy.run_path(path)

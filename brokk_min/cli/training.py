@@ -35,6 +35,7 @@ class Training(Command):
 
     def recipe(self) -> Recipe:
         """The agent, its learner and its task."""
+        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         learner, task = self.learner, self.task
         check_settings(learner)
         check_settings(task)

@@ -43,7 +43,7 @@ def test_train__goes_on_only_if_it_is_told_to(tmp_path, capsys):
     assert run(line) == 2
     assert "checkpoint: expected --resume or no checkpoint, got one" in capsys.readouterr().err
     assert run(f"{line} --resume") == 1
-    assert "No such file or directory: 'missing.npz'" in capsys.readouterr().err
+    assert "missing.npz: no such file" in capsys.readouterr().err
 
 
 def test_porting_page__names_all_settings_and_no_others():

@@ -3,6 +3,8 @@
 `python tests/paper/test_paper.py` writes the links to lines at the end of PAPER.md.
 """
 
+import ast
+import inspect
 import re
 import runpy
 from collections.abc import Iterator
@@ -13,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 MAKER = runpy.run_path(str(ROOT / "docs" / "annotated.py"))
-definition = MAKER["definition"]
+definition, name_of = MAKER["definition"], MAKER["name_of"]
 PAGE = ROOT / "PAPER.md"
 PAPER, LINKS = PAGE.read_text().split(
     "<!-- links: written by `python tests/paper/test_paper.py` -->\n"
@@ -80,13 +82,18 @@ def test_deviations__are_named_by_rows_and_explained() -> None:
 
 
 @cache
-def all_tests() -> list[tuple[str, Path, int]]:
-    """Name, file and line of each test function of the suite."""
-    found = []
-    for path in (ROOT / "tests").rglob("test_*.py"):
-        for number, line in enumerate(path.read_text().splitlines(), 1):
-            if name := re.match(r"def (test_\w+)\(", line):
-                found.append((name[1], path, number))
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def all_tests() -> dict[str, list[tuple[Path, int]]]:
+    """Files and lines of each test function of the suite."""
+    found: dict[str, list[tuple[Path, int]]] = {}
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        for node in parsed(path).body:
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                found.setdefault(node.name, []).append((path, node.lineno))
     return found
 
 
@@ -95,7 +102,7 @@ def place_of(label: str) -> tuple[Path, int]:
     if not label.startswith("test_"):
         path, node = definition(label)
         return path, getattr(node, "lineno", 1)  # a module: its docstring
-    places = [(path, line) for name, path, line in all_tests() if name == label]
+    places = all_tests().get(label, [])
     if len(places) != 1:
         raise ValueError(f"{label}: expected one test of this name, got {places}")
     return places[0]
@@ -116,23 +123,30 @@ def test_links__point_at_the_line() -> None:
 
 
 def documented() -> Iterator[tuple[str, str]]:
-    """Module and tag of each docstring of the package that names a place of the paper.
+    """Symbol and tag of each docstring of the package that names a place of the paper.
 
     A tag stands behind "Paper:", up to the end of the paragraph.
     """
-    several = r"(Fig\.|Sec\.) ((?:\d[\d.a-h]*(?:,\s| and )?)+)"
-    for path in (ROOT / "brokk_min").rglob("*.py"):
-        for tagged in re.findall(r'Paper: (.*?)(?:\n\s*\n|""")', path.read_text(), re.S):
-            for tag in re.findall(r"eq\d|Table \d", tagged):
-                yield path.stem, tag
-            for kind, numbers in re.findall(several, tagged):
-                for number in re.findall(r"\d[a-h]?(?:\.\d)?", numbers):
-                    yield path.stem, f"{kind} {number}"
+    several = r"(Fig\.|Sec\.) ((?:\d[\d.a-h]*(?:, | and )?)+)"
+    for path in sorted((ROOT / "brokk_min").rglob("*.py")):
+        nodes: list[tuple[str, ast.Module | ast.FunctionDef | ast.ClassDef]] = [
+            (path.stem, parsed(path))
+        ]
+        for symbol, node in nodes:
+            text = inspect.cleandoc(ast.get_docstring(node) or "")
+            for tagged in re.findall(r"Paper: (.*?)(?:\n\s*\n|$)", text, re.S):
+                for tag in re.findall(r"eq\d|Table \d", tagged):
+                    yield symbol, tag
+                for kind, numbers in re.findall(several, tagged):
+                    for number in re.findall(r"\d[a-h]?(?:\.\d)?", numbers):
+                        yield symbol, f"{kind} {number}"
+            parts = [part for part in node.body if isinstance(part, ast.FunctionDef | ast.ClassDef)]
+            nodes += [(f"{symbol}.{part.name}", part) for part in parts]
 
 
 def test_docstrings_and_rows__name_each_other() -> None:
     """A tag `Fig. 6` stands for all its panels, and one of a module's tags for its definitions."""
-    tags = set(documented())
+    tags = {(symbol.partition(".")[0], tag) for symbol, tag in documented()}
     named = {(s.partition(".")[0], row[0]) for row in NAMED for s in labels(row[-3])}
     constants = {(s.partition(".")[0], row[1]) for row in CONSTANT for s in labels(row[-3])}
     for module, tag in tags:
@@ -146,25 +160,50 @@ def test_docstrings_and_rows__name_each_other() -> None:
 # --- tests use the code of their row --------------------------------------------------------------
 
 
-def names_used(path: Path) -> set[str]:
-    """Words of a test file and of the helpers that it imports."""
-    text = path.read_text()
-    helpers = re.findall(r"^from (helpers_\w+) import", text, re.M)
-    texts = [text, *((ROOT / "tests" / f"{name}.py").read_text() for name in helpers)]
-    return set(re.findall(r"\w+", " ".join(texts)))
+@cache
+def parts(path: Path) -> dict[str, ast.stmt]:
+    """Definitions of a test file, and of the modules of `tests/` that it imports, by name."""
+    found: dict[str, ast.stmt] = {}
+    for node in parsed(path).body:
+        if name := name_of(node):
+            found[name] = node
+        helpers = ROOT / "tests" / f"{getattr(node, 'module', None)}.py"
+        if isinstance(node, ast.ImportFrom) and helpers.exists():
+            found |= parts(helpers)
+    return found
+
+
+def names_used(path: Path, test: str) -> set[str]:
+    """Names in a test and in all that it calls of its file and of helpers; imported modules."""
+    imports = re.findall(r"^(?:from|import) brokk_min(.*)", path.read_text(), re.M)
+    names = set(re.findall(r"\w+", " ".join(imports))) & {s for s in LABELS if "." not in s}
+    ahead = [test]
+    while ahead:
+        for node in ast.walk(parts(path)[ahead.pop()]):
+            for field in ("id", "attr", "arg", "value"):
+                name = getattr(node, field, None)
+                if isinstance(name, str) and name not in names:
+                    names.add(name)
+                    ahead += [name] if name in parts(path) else []
+    return names
 
 
 @pytest.mark.parametrize(("code", "test"), [row[:2] for row in ROWS if labels(row[1])])
 def test_tests__use_the_code_of_their_row(code: str, test: str) -> None:
-    used = set().union(*(names_used(place_of(name)[0]) for name in labels(test)))
+    used = set().union(*(names_used(place_of(name)[0], name) for name in labels(test)))
     missing = {symbol for symbol in labels(code) if symbol.rpartition(".")[2] not in used}
     assert not missing, f"{test} do not use {missing}"
 
 
 def write() -> None:
-    """Write the links at the end of PAPER.md; ValueError: one points at nothing."""
-    links = "\n".join(link(label) for label in LABELS)
-    PAGE.write_text(PAGE.read_text().removesuffix(LINKS) + f"\n{links}\n")
+    """Write the links at the end of PAPER.md; print what is no longer there."""
+    lines = []
+    for label in LABELS:
+        try:
+            lines.append(link(label))
+        except ValueError as error:
+            print(error)
+    PAGE.write_text(PAGE.read_text().removesuffix(LINKS) + "\n" + "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
