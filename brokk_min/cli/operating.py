@@ -98,7 +98,7 @@ def find_controller(machine: Machine, policy: Path | None, rl: bool) -> Controll
 def status(drive: hw.Drive) -> str:
     """One line: state, faults, goal and measured tool velocity [m/s], angles [rad], lateness."""
     driving, v_goal = drive.gate.driving, drive.operator_input.v_goal
-    active = fault_name(drive.machine, int(drive.gate.active_fault))
+    active = str(drive.gate.active_fault)
     words = ["driving" if driving else "waiting" if active else "ready", drive.reason]
     if active not in drive.reason:
         words.append(f"now {active}")  # what is in the way

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, read_json, whole_file
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST
-from brokk_min.evaluation.metrics import COLUMNS, Traces, interval_text
+from brokk_min.evaluation.metrics import COLUMNS, Mean, Traces, interval_text
 from brokk_min.evaluation.preliminary import Curves, Motion, Tests
 from brokk_min.evaluation.rollout import TITLES, valves_at_rest
 from brokk_min.evaluation.sequences import AXES, Commands, axis_sequences
@@ -40,8 +40,9 @@ LINES = ("-", "--", "-.", ":")
 def write_report(out: Path, machine: Machine, results: Results, measured: Measured) -> None:
     """Write `report.html` to the folder `out`; `measured` is what the paper's figures show."""
     tests, gap, traces = measured
-    starts = np.array(results["starts"])
+    starts, table = np.array(results["starts"]), first_table(results)
     drawn = {
+        "errors": plot_errors({c: table[c]["velocity_error_mean"] for c in ROWS}),
         "tests": plot_tests(machine, tests),
         "gap": plot_gap(machine, gap),
         "starts": plot_starts(machine, starts),
@@ -61,18 +62,21 @@ def png(figure: Figure) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
+def first_table(results: Results) -> Any:
+    """Means along x, y and z: those of the package for a trial, which are of the full chain."""
+    shipped = SHIPPED / results["meta"]["machine"] / "table.json"
+    trial = results["meta"]["effort"]["hours"] < 1 and shipped.exists()
+    return (read_json(shipped, "JSON") if trial else results)["table"]
+
+
 def render(results: Results, images: Mapping[str, str]) -> str:
-    """The page, with PNG `images` in base64 by name; a trial begins with the shipped table."""
-    about = results["meta"]
-    shipped = SHIPPED / about["machine"] / "table.json"
-    trial = about["effort"]["hours"] < 1 and shipped.exists()
-    table = (read_json(shipped, "JSON") if trial else results)["table"]
-    bound = BOUND if about["machine"] == BROKK_170.name else None
+    """The page, with PNG `images` in base64 by name."""
+    bound = BOUND if results["meta"]["machine"] == BROKK_170.name else None
     text = Path(__file__).with_suffix(".html.j2").read_text("utf-8")
     page: Template = Template(text, autoescape=True, undefined=StrictUndefined)
     page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, titles=TITLES)
     page.globals.update(rest=valves_at_rest, interval=interval_text)
-    return page.render(results=results, images=images, bound=bound, table=table)
+    return page.render(results=results, images=images, bound=bound, table=first_table(results))
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -128,6 +132,19 @@ def plot_gap(machine: Machine, gap: Motion) -> Figure:
         curves = {"median of all runs": np.median(values, axis=-1), "first run": values[..., 0]}
         rows.append(([f"{name} [{unit}/s]", f"{name} [m{unit}]"], curves))
     return plot_over_time(machine.dt, rows)
+
+
+def plot_errors(errors: Mapping[str, Mean]) -> Figure:
+    """Mean velocity errors [m/s] with their intervals, a row for each controller."""
+    figure = Figure(figsize=(WIDTH, 0.5 + 0.4 * len(errors)), layout="constrained")
+    ax = figure.subplots()
+    ends = [[error[key] for key in ("low", "mean", "high")] for error in errors.values()]
+    low, mean, high = np.array(ends, float).T
+    ax.errorbar(mean, range(len(errors)), xerr=[mean - low, high - mean], fmt="o", capsize=4)
+    ax.set_yticks(range(len(errors)), [TITLES[name] for name in errors])
+    ax.set(xlabel="mean velocity error [m/s]", xlim=(0, None), ylim=(len(errors) - 0.5, -0.5))
+    ax.grid(alpha=0.3)
+    return figure
 
 
 def plot_starts(machine: Machine, starts: Array) -> Figure:

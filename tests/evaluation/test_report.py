@@ -49,7 +49,7 @@ def first_screen(page):
     return numbers, rows[1:], rest
 
 
-def test_render__begins_with_one_sentence_and_a_table():
+def test_render__begins_with_one_sentence_a_figure_and_a_table():
     """And ends with the leads within a class."""
     page = render()
     numbers, rows, rest = first_screen(page)
@@ -58,7 +58,7 @@ def test_render__begins_with_one_sentence_and_a_table():
     assert [row[0] for row in rows] == [*names, "PPO, our interface", "strongest PID"]
     # two starts, 0.0100 and 0.0102: half an interval is 12.7062 x 0.0002 / sqrt(2) / sqrt(2)
     assert rows[3][1:3] == ["closed", "0.0101 (0.0088 to 0.0114)"]
-    assert "trial" not in rest
+    assert page.index("<img") < page.index("<table") and "trial" not in rest
     last = page.split("<h2>")[-1]
     heads = re.findall("<th>lead of (.*?) over (.*?)</th>", last)
     assert heads[2] == ("PPO, our interface", "strongest PID")
@@ -100,6 +100,18 @@ def test_plot_tests__shows_machine_above_nets():
     np.testing.assert_array_equal(curves(sweeps)["u = 50"], [x, 2 * x])
     np.testing.assert_array_equal(curves(coupling)["alone"], [x, -2 * x])
     np.testing.assert_array_equal(curves(steps)["idle"], [x, 2 + x])
+
+
+def test_plot_errors__has_a_row_with_an_interval_for_each_controller():
+    errors = {"rl": {"mean": 2.0, "low": 1.0, "high": 3.0}}
+    errors["pid_by_hand"] = {"mean": 5.0, "low": 4.0, "high": 6.0}
+    (ax,) = report.plot_errors(errors).axes
+    labels = [text.get_text() for text in ax.get_yticklabels()]
+    assert labels == ["PPO, our interface", "PID by hand"]
+    ((mean, _, (bars,)),) = ax.containers
+    assert np.array(mean.get_data()).tolist() == [[2, 5], [0, 1]]
+    ends = [segment[:, 0].tolist() for segment in bars.get_segments()]
+    assert ends == [[1, 3], [4, 6]]
 
 
 def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
