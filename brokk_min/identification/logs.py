@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 from brokk_min._files import brief, expected, whole_file, write_csv
 from brokk_min.actuator import estimate_velocity
 from brokk_min.identification.columns import TOPICS, Mapped, load_table
-from brokk_min.identification.readings import MAX_GAP, check_run, left_out, unread
+from brokk_min.identification.readings import Rows, check_run, left_out, pieces_of
 from brokk_min.machine import Array, Machine, require
 
 RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
 MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
 MEAN_OF = 10  # samples of the held command in a tick, of which the mean is taken
-LARGEST = 1e12  # of numbers in a log, assumed: any time, angle or velocity
-Rows = NDArray[np.intp]
 
 
 class Recording(NamedTuple):
@@ -73,12 +71,9 @@ class Samples(NamedTuple):
 
     def starts(self, before: int, after: int, step: int) -> Rows:
         """Every `step`-th sample with `before` and `after` samples around it in its recording."""
-        result = []
-        seam = 0
-        for length in self.lengths:
-            result.append(seam + np.arange(before, length - after, step))
-            seam += length
-        return np.concatenate(result)
+        seams = np.cumsum([0, *self.lengths])
+        parts = [np.arange(before, length - after, step) for length in self.lengths]
+        return np.concatenate([seam + part for seam, part in zip(seams, parts, strict=False)])
 
     def windows(self, history: int, ticks: int) -> list[Rows]:
         """Newest samples of windows of `history` samples, `ticks` before an end, of each joint."""
@@ -135,14 +130,14 @@ def join_logs(logs: Mapping[Path, Log]) -> Log:
     ValueError: they have other joints, or all are empty.
     """
     first = next(iter(logs.values()))
-    joined: list[Log] = []
+    recordings: list[Recording] = []
+    warnings: list[str] = []
     for path, log in logs.items():
         with expected(path, "a log"):
-            joined.append(in_order(log, first.joints))
-    recordings = tuple(one for log in joined for one in log.recordings)
+            recordings += in_order(log, first.joints).recordings
+        warnings += log.warnings
     require(len(recordings) > 0, ", ".join(map(str, logs)), "at least one recording", "none")
-    warnings = tuple(one for log in joined for one in log.warnings)
-    return first._replace(recordings=recordings, warnings=warnings)
+    return first._replace(recordings=tuple(recordings), warnings=tuple(warnings))
 
 
 def write_log(path: Path, log: Log) -> None:
@@ -174,67 +169,27 @@ def read_log(
     machine.
     ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
-    table = load_table(path, mapped or {}, topics)
     with expected(path, "a log"):
+        table = load_table(path, mapped or {}, topics)
         joints = tuple(name[2:] for name in table if name.startswith("u_"))
-        wanted = "u_<joint> (--map u_NAME=COLUMN:UNIT)"
-        require(len(joints) > 0, "columns", wanted, brief(list(table)))
-        recordings, warnings = _recordings(joints, table, machine)
-        told = tuple(f"{path}: {one}" for one in warnings)
-        return Log(joints, tuple(recordings), machine.rate, told)
-
-
-def _recordings(
-    joints: Sequence[str], table: Mapping[str, Any], machine: Machine
-) -> tuple[list[Recording], list[str]]:
-    """The recordings of a table, in the order in which they begin, and what was left out."""
-    time = _numbers(table, ["time"])[:, 0]
-    commands = _numbers(table, [f"u_{name}" for name in joints])
-    angles = _numbers(table, [f"q_{name}" for name in joints])
-    runs = _runs(table["run"])
-    speeds = dict(zip(machine.names, machine.q_dot_max, strict=True))
-    fastest = np.array([speeds.get(name, 0.0) for name in joints])
-    wrong, speed = np.zeros(angles.shape, bool), np.zeros(angles.shape)
-    recordings = []
-    for run, rows in runs.items():
-        t, u, q = time[rows], commands[rows], angles[rows]
-        repeats = check_run(run, t, q, machine.rate, joints)
-        bad, cuts = unread(t, q, fastest, repeats)
-        wrong[rows] = bad | cuts
-        speed[rows[1:]] = np.abs(np.diff(q, axis=0) / np.diff(t)[:, None])
-        good = np.flatnonzero(~bad.any(axis=1))
-        cut = np.diff(t[good]) > max(MAX_GAP, 2.5 / machine.rate)
-        cut |= np.diff(np.cumsum(cuts.any(axis=1))[good]) > 0
-        pieces = np.split(good, np.flatnonzero(cut) + 1)
-        for part, piece in enumerate(pieces if len(good) else []):
-            skipped = machine.velocity_samples - 1 if part else 0
-            sampled = [x[skipped:] for x in _resample(t, u, q, piece, machine)]
-            if len(sampled[0]):
-                recordings.append(Recording(f"{run}#{part + 1}" if part else run, *sampled))
-    return recordings, left_out(wrong, speed, joints)
-
-
-def _runs(names: Any) -> dict[str, Rows]:
-    """Rows of each recording, in the order in which they begin."""
-    unique, first, number = np.unique(names, return_index=True, return_inverse=True)
-    return {str(unique[i]): np.flatnonzero(number == i) for i in np.argsort(first)}
-
-
-def _numbers(table: Mapping[str, Any], names: Sequence[str]) -> Array:
-    """Columns (rows, names); ValueError: one that is not there, or a value that cannot be."""
-    missing = [name for name in names if name not in table]
-    wanted = f"{brief(missing)} (--map {missing[0]}=COLUMN:UNIT)" if missing else ""
-    require(not missing, "columns", wanted, brief(list(table)))
-    for name in names:
-        wanted, got = (np.shape(table[key]) for key in ("run", name))
-        require(got == wanted, f"column {name}", f"{wanted} numbers", got)
-    values = np.array([table[name] for name in names], float).T
-    limit = 1.0 if names[0].startswith("u_") else LARGEST
-    for row, column in np.argwhere(~(np.abs(values) <= limit)):  # also where it is nan
-        place, got = f"row {row + 2}, column {names[column]}", values[row, column]
-        unit = f" (per cent: --map {names[column]}=COLUMN:percent)" if limit == 1.0 else ""
-        raise ValueError(f"{place}: expected -{limit:g} to {limit:g}{unit}, got {got}")
-    return values
+        u, q = (np.array([table[f"{kind}_{name}"] for name in joints]).T for kind in "uq")
+        speeds = dict(zip(machine.names, machine.q_dot_max, strict=True))
+        fastest = np.array([speeds.get(name, 0.0) for name in joints])
+        wrong = np.zeros(q.shape, bool)
+        recordings = []
+        unique, first, number = np.unique(table["run"], return_index=True, return_inverse=True)
+        for i in np.argsort(first):
+            run, rows = str(unique[i]), np.flatnonzero(number == i)
+            time, angles = table["time"][rows], q[rows]
+            repeats = check_run(run, time, angles, machine.rate, joints)
+            pieces, wrong[rows] = pieces_of(time, angles, machine.rate, fastest, repeats)
+            for part, piece in enumerate(pieces):
+                skipped = machine.velocity_samples - 1 if part else 0
+                sampled = [x[skipped:] for x in _resample(time, u[rows], angles, piece, machine)]
+                if len(sampled[0]):
+                    recordings.append(Recording(f"{run}#{part + 1}" if part else run, *sampled))
+        warnings = tuple(f"{path}: {one}" for one in left_out(wrong, q, joints))
+        return Log(joints, tuple(recordings), machine.rate, warnings)
 
 
 def _resample(

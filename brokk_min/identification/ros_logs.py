@@ -5,11 +5,10 @@ in a `std_msgs/Float64MultiArray` in the order of the angles. A row is a message
 the commands that hold then. All times are the recorder's, so both topics have one clock.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from brokk_min._files import brief, expected, require_package
+from brokk_min._files import expected, require_package
 from brokk_min.machine import require
 
 
@@ -21,31 +20,26 @@ def read_ros(path: Path, angles: str, commands: str) -> dict[str, Any]:
     reader_of = require_package("rosbags.highlevel", "ros").AnyReader
     types = require_package("rosbags.typesys", "ros")
     store = types.get_typestore(types.Stores.ROS2_HUMBLE)  # of bags without definitions
-    with expected(path, "a recording of ROS"), reader_of([path], default_typestore=store) as bag:
-        found = {topic: info.msgtype for topic, info in bag.topics.items()}
-        for topic in (angles, commands):
-            require(topic in found, f"{path}: --topics", f"two of {found}", brief(topic))
-        rows = list(samples(bag, angles, commands))
-    require(len(rows) > 0, str(path), f"{angles} after {commands}, of the same joints", "none")
-    return {column: [row[column] for row in rows] for column in rows[0]}
-
-
-def samples(bag: Any, angles: str, commands: str) -> Iterator[dict[str, float]]:
-    """`time` [s], `u_` and `q_` of each joint, of each message with angles after a command."""
+    rows: list[dict[str, float]] = []
     order: list[str] = []
     q: dict[str, float] = {}
     u: dict[str, float] = {}
-    chosen = [one for one in bag.connections if one.topic in (angles, commands)]
-    for connection, stamp, data in bag.messages(chosen):
-        message = bag.deserialize(data, connection.msgtype)
-        if connection.topic == angles:
-            order = order or list(message.name)
-            q |= dict(zip(message.name, message.position, strict=True))
-            if u and u.keys() <= q.keys():
-                row = {"time": stamp / 1e9} | {f"u_{name}": x for name, x in u.items()}
-                yield row | {f"q_{name}": q[name] for name in u}
-        elif order:
-            u = commands_of(message, order)
+    with expected(path, "a recording of ROS"), reader_of([path], default_typestore=store) as bag:
+        for topic in (angles, commands):
+            require(topic in bag.topics, f"{path}: --topics", f"two of {[*bag.topics]}", topic)
+        chosen = [one for one in bag.connections if one.topic in (angles, commands)]
+        for connection, stamp, data in bag.messages(chosen):
+            message = bag.deserialize(data, connection.msgtype)
+            if connection.topic == angles:
+                order = order or list(message.name)
+                q |= dict(zip(message.name, message.position, strict=True))
+                if u and u.keys() <= q.keys():
+                    row = {"time": stamp / 1e9} | {f"u_{name}": x for name, x in u.items()}
+                    rows.append(row | {f"q_{name}": q[name] for name in u})
+            elif order:
+                u = commands_of(message, order)
+    require(len(rows) > 0, str(path), f"{angles} after {commands}, of the same joints", "none")
+    return {column: [row[column] for row in rows] for column in rows[0]}
 
 
 def commands_of(message: Any, order: list[str]) -> dict[str, float]:

@@ -32,7 +32,7 @@ def test_read_ros__has_angles_and_the_commands_that_hold(tmp_path, plugin, kind)
 
 def test_read_ros__names_what_is_missing(tmp_path):
     path = record(tmp_path / "bag", drive(lambda k: multi_array([0.0, 0.0])))
-    with pytest.raises(ValueError, match=r"bag: --topics: expected two of .*/valves.*got '/u'"):
+    with pytest.raises(ValueError, match=r"bag: --topics: expected two of .*/valves.*got /u"):
         read_ros(path, "/joint_states", "/u")
     with pytest.raises(ValueError, match=r"commands: expected one of each \['boom', 'wheel', "):
         read_ros(path, "/joint_states", "/valves")
