@@ -9,13 +9,13 @@ A grid gives delay, lag and dead zones, and least squares give the gains. Sample
 recorded range do not count, because a joint that is pushed against its stop stands still.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 from tqdm import tqdm
 
@@ -30,7 +30,6 @@ ZONES = 0.01 * np.arange(61)  # dead zones, of full command
 AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
 PAUSE = 2.0  # s, after so long a joint without commands is at rest
 CLEAR_SIGN = 0.1  # least correlation that has a clear sign
-OPPOSITE = 0.4  # least correlation of a recording with the other sign
 FASTEST = 0.999  # quantile of the speeds, because the single ones have noise
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
@@ -54,7 +53,7 @@ class JointReport:
     dead_zone: tuple[float, float]  # of full command
     gain: tuple[float, float]  # rad/s per command beyond the dead zone; 0: it never moved so
     fastest: tuple[float, float]  # rad/s, of the velocities in the log
-    opposite: tuple[str, ...]  # recordings in which the velocity has the other sign
+    opposite: tuple[str, ...]  # recordings in which it falls under positive commands
     follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
 
 
@@ -67,15 +66,15 @@ def inspect(log: Log) -> dict[str, JointReport]:
             ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
             q = np.concatenate([one.q[:, j] for one in recordings])
             q_dot = np.concatenate([one.q_dot[:, j] for one in recordings])
-            model = fit_model(motion_of(recordings, j, log.rate))
+            signs = [sign(motion_of([one], j, log.rate)) for one in recordings]
             reports[name] = JointReport(
                 minutes=ticks / log.rate / 60,
                 low=float(q.min()),
                 high=float(q.max()),
                 fastest=(float(np.quantile(q_dot, FASTEST)), float(np.quantile(-q_dot, FASTEST))),
-                opposite=opposite_recordings(recordings, j, log.rate, model),
+                opposite=tuple(recordings[i].name for i, one in enumerate(signs) if one < 0),
                 follows=followed_joints(log, j),
-                **model,
+                **fit_model(motion_of(recordings, j, log.rate)),
             )
     return reports
 
@@ -100,27 +99,15 @@ def motion_of(recordings: list[Recording], j: int, rate: float) -> Motion:
     return Motion(u, (q_next - q) * rate * counts, counts, rate)
 
 
-def correlation(motion: Motion) -> float:
-    """That of commands and velocities over a second, because fast sines fit reversed as well."""
+def sign(motion: Motion) -> int:
+    """That of velocities under positive commands; 0: not clear.
+
+    Both are means over a second, because fast sines fit reversed as well.
+    """
     second = np.ones(round(motion.rate)) / round(motion.rate)
     u, velocity = (np.convolve(x, second, "same") for x in (motion.u, motion.velocity))
     size = np.linalg.norm(motion.u) * np.linalg.norm(motion.velocity)
-    return float(u @ velocity / max(size, 1e-12))
-
-
-def opposite_recordings(
-    recordings: list[Recording], j: int, rate: float, model: Mapping[str, Any]
-) -> tuple[str, ...]:
-    """Names of the recordings in which joint `j` moves against the model of all of them."""
-    names = []
-    for one in recordings:
-        motion = motion_of([one], j, rate)
-        lag = (round(model["delay"] * rate), model["tau"])
-        expected = model["gain"] @ responses(motion, lag, model["dead_zone"])
-        size = np.linalg.norm(expected) * np.linalg.norm(motion.velocity)
-        if expected @ motion.velocity < -OPPOSITE * size:
-            names.append(one.name)
-    return tuple(names)
+    return int(np.sign(u @ velocity)) if abs(u @ velocity) > CLEAR_SIGN * size else 0
 
 
 def followed_joints(log: Log, j: int) -> dict[str, float]:
@@ -149,10 +136,9 @@ def fit_model(motion: Motion) -> dict[str, Any]:
             zones = min(trials, key=lambda trial: fit_gains(motion, lag, trial)[0])
     error, gains = fit_gains(motion, lag, zones)
     power = float(np.square(motion.velocity[motion.counts]).sum())
-    clear = correlation(motion)
     return {
         "explained": 1 - error / power if power else 0.0,
-        "sign": int(np.sign(clear)) if abs(clear) > CLEAR_SIGN else 0,
+        "sign": sign(motion),
         "delay": lag[0] / motion.rate,
         "tau": lag[1],
         "dead_zone": tuple(zones.round(3).tolist()),
@@ -162,34 +148,25 @@ def fit_model(motion: Motion) -> dict[str, Any]:
 
 def fit_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> tuple[float, Array]:
     """Sum of the squared errors of the model with the best gains (2,), and these gains."""
-    x = responses(motion, lag, zones)[:, motion.counts]
+    (delay, tau), (up, down) = lag, zones
+    late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
+    openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
+    a = np.exp(-1 / (motion.rate * tau))
+    x = lfilter([1 - a], [1, -a], openings)[:, motion.counts]  # velocities if the gains are 1
     velocity = motion.velocity[motion.counts]
     gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
     error = velocity - gains @ x
     return float(error @ error), gains
 
 
-def responses(motion: Motion, lag: tuple[int, float], zones: ArrayLike) -> Array:
-    """Velocities (2, T) upwards and downwards if the gains are 1."""
-    (delay, tau), (up, down) = lag, np.asarray(zones)
-    late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
-    openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
-    a = np.exp(-1 / (motion.rate * tau))
-    return np.asarray(lfilter([1 - a], [1, -a], openings))
-
-
 def wrong_signs(reports: Mapping[str, JointReport]) -> list[str]:
-    """Joints whose angle falls under positive commands in all recordings or in some, in words."""
-    result = []
-    for name, report in reports.items():
-        wanted, change = f"positive commands to raise q_{name}", f"(--map {name}=COLUMN:-1)"
-        if report.sign < 0:
-            got = f"{report.gain[0]:.2f} rad/s per full opening {change}"
-            result.append(f"u_{name}: expected {wanted}, got {got}")
-        if report.opposite:
-            got = f"the other sign in {brief(list(report.opposite))}"
-            result.append(f"u_{name}: expected one sign in all recordings, got {got} {change}")
-    return result
+    """Joints whose angle falls under positive commands, in words."""
+    return [
+        f"u_{name}: expected positive commands to raise q_{name}, got falling angles in "
+        f"{brief(list(report.opposite))} (--map {name}=COLUMN:-1)"
+        for name, report in reports.items()
+        if report.opposite
+    ]
 
 
 def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | None) -> list[str]:
@@ -199,42 +176,44 @@ def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | No
         if name not in reports:
             result.append(f"{name}: expected commands in the log, got none")
             continue
-        r = reports[name]
-        if r.minutes < LEAST_MINUTES:
-            result.append(f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}")
-        if r.follows:
-            slopes = ", ".join(f"{slope:+.2f} times with {one}" for one, slope in r.follows.items())
-            doubt = "is it an angle to the ground? Then take differences of both angles"
-            result.append(f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}")
-        elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 1e-9:
-            wanted = f"commands that explain {LEAST_EXPLAINED:.0%} of its motion, soon after them"
-            got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
-            result.append(f"{name}: expected {wanted}, got {got}")
+        result += motion_warnings(name, reports[name])
         if machine:
-            result += range_warnings(machine.joints[machine.names.index(name)], r)
+            result += range_warnings(machine.joints[machine.names.index(name)], reports[name])
     return result
 
 
-def range_warnings(joint: Joint, report: JointReport) -> list[str]:
+def motion_warnings(name: str, r: JointReport) -> Iterator[str]:
+    """Does a joint move for long enough, and by its commands alone?"""
+    if r.minutes < LEAST_MINUTES:
+        yield f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}"
+    if r.follows:
+        slopes = ", ".join(f"{slope:+.2f} times with {one}" for one, slope in r.follows.items())
+        doubt = "is it an angle to the ground? Then take differences of both angles"
+        yield f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}"
+    elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 1e-9:
+        wanted = f"commands that explain {LEAST_EXPLAINED:.0%} of its motion, soon after them"
+        got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
+        yield f"{name}: expected {wanted}, got {got}"
+
+
+def range_warnings(joint: Joint, r: JointReport) -> Iterator[str]:
     """Is a joint's motion within its range, and over most of it?"""
-    whole, low, high = joint.q_max - joint.q_min, report.low, report.high
-    if max(joint.q_min - low, high - joint.q_max) > BEYOND * whole:
-        wanted = f"{joint.name}: expected angles of {joint.q_min:g} to {joint.q_max:g}"
+    whole = joint.q_max - joint.q_min
+    if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
+        wanted = f"angles of {joint.q_min:g} to {joint.q_max:g}"
         unit = f"another unit (--map {joint.name}=COLUMN:deg), zero or joint?"
-        return [f"{wanted}, got {low:.2f} to {high:.2f}: {unit}"]
-    if high - low < LEAST_RANGE * whole:
+        yield f"{joint.name}: expected {wanted}, got {r.low:.2f} to {r.high:.2f}: {unit}"
+    elif r.high - r.low < LEAST_RANGE * whole:
         wanted = f"{LEAST_RANGE:.0%} of its range or more"
-        return [f"{joint.name}: expected {wanted}, got {(high - low) / whole:.0%}"]
-    return []
+        yield f"{joint.name}: expected {wanted}, got {(r.high - r.low) / whole:.0%}"
 
 
 def table(reports: Mapping[str, JointReport]) -> list[str]:
     """Lines of what a log tells, and fields of `Joint` by it, to copy into a machine."""
-    row = "{:12} {:>7} {:>4} {:>9} {:>9}  {:8} {}"
-    lines = [row.format("joint", "minutes", "sign", "explained", "delay [s]", "gain up", "down")]
+    lines = ["joint        minutes sign explained delay [s]  gain up  down"]
     for name, r in reports.items():
-        numbers = (f"{r.minutes:.1f}", f"{r.sign:+d}", f"{r.explained:.0%}", f"{r.delay:.2f}")
-        lines.append(row.format(name, *numbers, *(f"{gain:.3f}" for gain in r.gain)))
+        numbers = f"{r.minutes:7.1f} {r.sign:+4d} {r.explained:9.0%} {r.delay:9.2f}"
+        lines.append(f"{name:12} {numbers}  {r.gain[0]:<8.3f} {r.gain[1]:.3f}")
     for name, r in reports.items():
         limits = f"q_min={r.low:.3f}, q_max={r.high:.3f}"
         speeds = "q_dot_up={:.3f}, q_dot_down={:.3f}".format(*r.fastest)
