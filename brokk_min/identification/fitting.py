@@ -24,10 +24,11 @@ from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
-from brokk_min.identification.net_file import ARRAYS
 from brokk_min.machine import Array, Machine, require
 
 __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
+
+ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")  # of nets
 
 
 def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = "") -> ActuatorNet:
@@ -42,7 +43,8 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
     if not (name and config.valve):
         config = replace(config, valve=False, members=1)
     index = [machine.names.index(joint) for joint in log.joints] if name else []
-    data = training_set(log, config, machine, machine.dead_zones[index].astype(np.float32))
+    zones = machine.dead_zones[index].astype(np.float32)
+    data = training_set(log, config, machine, zones)
     seeds = range(seed * config.members, (seed + 1) * config.members)
     members = [train(data, config, one) for one in seeds]
     fields: dict[str, Any] = {
@@ -52,15 +54,15 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
         "velocity_samples": machine.velocity_samples,
         "machine": name,
         "training": {"seed": seed, "settings": asdict(config)},
+        "weights": members[0],
         **{key: getattr(data, key).numpy() for key in ARRAYS},
     }
-    if data.zones is None:
-        return ActuatorNet(**fields, weights=members[0])
-    zones = data.zones.numpy()
+    if not config.valve:
+        return ActuatorNet(**fields)
     if config.members == 1:
-        return ValveNet(**fields, weights=members[0], dead_zones=zones)
-    weights = tuple(np.stack(of, axis=1) for of in zip(*members, strict=True))
-    return NetEnsemble(**fields, weights=weights, dead_zones=zones)
+        return ValveNet(**fields, dead_zones=zones)
+    fields["weights"] = tuple(np.stack(of, axis=1) for of in zip(*members, strict=True))
+    return NetEnsemble(**fields, dead_zones=zones)
 
 
 @dataclass(frozen=True)
@@ -94,21 +96,20 @@ def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) ->
         moves = len(target) > 0 and np.ptp(target) > 0
         wanted = f"a recording of {H + 1} samples or more in which it moves"
         require(bool(moves), f"joint {name}", wanted, "none")
-    signals = np.stack([joined.joined.q, joined.joined.q_dot, joined.joined.u], dtype=np.float32)
+    _, u, q, q_dot = joined.joined
+    signals = np.stack([q, q_dot, u], dtype=np.float32)
     rows = signals[..., None].transpose(1, 2, 0, 3)  # each sample as a history of one: (N, n, 3, 1)
     read = valve_inputs(rows, zones) if config.valve else rows[..., 0]  # (N, n, rows)
     moments = [(read[at, j].mean(axis=0), read[at, j].std(axis=0)) for j, at in enumerate(windows)]
     mean, std = (np.repeat(np.array(part), H, axis=1) for part in zip(*moments, strict=True))
     low, high = (np.array([f(target) for target in targets]) for f in (np.min, np.max))
     margin = 0.05 * (high - low) + 1e-6  # rad/s
-    q = joined.joined.q
     t = (np.arange(machine.velocity_samples) - (machine.velocity_samples - 1) / 2) / log.rate
     reads = np.ones((read.shape[-1], H))
     if config.newest_only:
         reads[:2, :-1] = 0
-    arrays = (mean, np.where(std > 1e-9, std, 1.0), reads.ravel(), low - margin, high + margin)
+    arrays = (reads.ravel(), mean, np.where(std > 1e-9, std, 1.0), low - margin, high + margin)
     tensors = (torch.tensor(x).float() for x in (*arrays, q.min(axis=0), q.max(axis=0)))
-    names = ("input_mean", "input_scale", "reads", "output_low", "output_high", "q_low", "q_high")
     return TrainingSet(
         samples=torch.tensor(signals.transpose(2, 0, 1)),
         target=torch.tensor(joined.target.T).float(),
@@ -118,33 +119,35 @@ def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) ->
         history=H,
         estimator=torch.tensor(t / (t @ t)).float(),
         rate=log.rate,
-        **dict(zip(names, tensors, strict=True)),
+        **dict(zip(("reads", *ARRAYS), tensors, strict=True)),
     )
 
 
 def train(data: TrainingSet, config: FitConfig, seed: int) -> tuple[Array, ...]:
-    """Weights of one net for each joint, as in `ActuatorNet.weights`."""
+    """Weights of one net for each joint, as in `ActuatorNet.weights`.
+
+    In each stage the learning rate falls to zero by a cosine.
+    """
     torch.set_num_threads(1)  # several wait in vain on busy cores
     generator = Generator().manual_seed(seed)
     weights = initial_weights(data, config, generator)
-    optimizer = torch.optim.AdamW(
-        weights, config.learning_rate, weight_decay=config.weight_decay, fused=True
-    )
-    several = config.rollout > 1 and all(map(len, data.long_windows))
-    one_step = round(0.65 * config.steps) if several else config.steps
-    for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
-        optimizer.param_groups[0]["lr"] = config.learning_rate * decay(step, one_step, config.steps)
-        if step < one_step:
-            at = draw_windows(data.windows, config.batch_size, generator)
-            loss = accumulated_loss(data, weights, at, 1)
-        else:
-            at = draw_windows(data.long_windows, math.ceil(config.batch_size / 4), generator)
-            loss = accumulated_loss(data, weights, at, config.rollout)
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-    if not all(bool(torch.isfinite(weight).all()) for weight in weights):
-        raise ValueError("weights: expected finite numbers at the end of the fit, got nan or inf")
+    optimizer = torch.optim.AdamW(weights, weight_decay=config.weight_decay, fused=True)
+    rate, batch, steps = config.learning_rate, config.batch_size, config.steps
+    stages = [(steps, rate, data.windows, batch, 1)]
+    if config.rollout > 1 and all(map(len, data.long_windows)):
+        first = round(0.65 * steps)
+        free_runs = (steps - first, rate / 4, data.long_windows, math.ceil(batch / 4))
+        stages = [(first, rate, data.windows, batch, 1), (*free_runs, config.rollout)]
+    for steps, rate, windows, batch, ticks in stages:
+        for step in tqdm(range(steps), desc=f"fit nets, {ticks} ticks", unit="step", disable=None):
+            optimizer.param_groups[0]["lr"] = 0.5 * rate * (1 + math.cos(math.pi * step / steps))
+            at = draw_windows(windows, batch, generator)
+            loss = accumulated_loss(data, weights, at, ticks)
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+    finite = all(bool(torch.isfinite(weight).all()) for weight in weights)
+    require(finite, "weights", "finite numbers at the end of the fit", "nan or inf")
     return tuple(weight.detach().numpy() for weight in weights)
 
 
@@ -154,23 +157,14 @@ def initial_weights(data: TrainingSet, config: FitConfig, generator: Generator) 
     Those of inputs that the nets do not read are zero, and stay so.
     """
     n, inputs = data.input_mean.shape
+    sizes = (inputs, config.hidden, config.hidden, 1)
     fan_in = (int(data.reads.sum()), config.hidden, config.hidden)
-    shapes = ((inputs, config.hidden), (config.hidden, config.hidden), (config.hidden, 1))
     weights = []
-    for (rows, columns), size in zip(shapes, fan_in, strict=True):
-        bound = math.sqrt(6 / size)
-        w = (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * bound
+    for rows, columns, size in zip(sizes[:-1], sizes[1:], fan_in, strict=True):
+        w = (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * math.sqrt(6 / size)
         weights += [w, torch.zeros(n, columns)]
     weights[0] *= data.reads[:, None]
     return [weight.requires_grad_() for weight in weights]
-
-
-def decay(step: int, one_step: int, steps: int) -> float:
-    """Factor of the learning rate: from 1 to 0 until `one_step`, then from 1/4 to 0."""
-    if step < one_step:
-        return 0.5 * (1 + math.cos(math.pi * step / one_step))
-    fraction = (step - one_step) / max(steps - one_step, 1)
-    return 0.125 * (1 + math.cos(math.pi * fraction))
 
 
 def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generator) -> Tensor:

@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,36 +16,29 @@ from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.machine import Array, Machine, require
 
 KIND = "actuator net 5"
-HEADER = ("joints", "history", "rate", "velocity_samples", "machine", "training")
-ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")
 CLASSES = {"paper": ActuatorNet, "valve": ValveNet, "ensemble": NetEnsemble}  # by name in files
 NAMES = {kind: name for name, kind in CLASSES.items()}
 
 
 def net_arrays(net: ActuatorNet) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Header and arrays of nets, as in their file; ValueError: a class that is not in `CLASSES`."""
-    known = ", ".join(kind.__name__ for kind in NAMES)
-    require(type(net) in NAMES, "net", f"one of {known}", type(net).__name__)
-    header = {name: getattr(net, name) for name in HEADER}
-    header["training"] = dict(net.training)
-    header["reads"] = NAMES[type(net)]
-    arrays = {name: getattr(net, name) for name in ARRAYS}
-    arrays |= {f"weight_{i}": weight for i, weight in enumerate(net.weights)}
-    if isinstance(net, ValveNet):
-        arrays["dead_zones"] = net.dead_zones
+    """Header and arrays of nets, as in their file."""
+    header: dict[str, Any] = {"reads": NAMES[type(net)]}
+    arrays: dict[str, Array] = {}
+    for name, value in vars(net).items():
+        if name == "weights":
+            arrays |= {f"weight_{i}": weight for i, weight in enumerate(value)}
+        else:
+            (arrays if isinstance(value, np.ndarray) else header)[name] = value
     return header, arrays
 
 
 def net_from_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Any]) -> Any:
     """Nets from `net_arrays`; ValueError, with `path`, for what is no net."""
     with expected(path, "a complete actuator net"):
-        fields = {name: header[name] for name in HEADER}
-        fields |= {name: arrays[name] for name in ARRAYS}
-        fields["joints"] = tuple(header["joints"])
-        fields["weights"] = tuple(arrays[f"weight_{i}"] for i in range(6))
-        if "dead_zones" in arrays:
-            fields["dead_zones"] = arrays["dead_zones"]
-        net = CLASSES[header["reads"]](**fields)
+        kind = CLASSES[header["reads"]]
+        found = {**header, **arrays, "joints": tuple(header["joints"])}
+        found["weights"] = tuple(arrays[f"weight_{i}"] for i in range(6))
+        net = kind(**{field.name: found[field.name] for field in fields(kind)})
         net.predict(np.zeros((1, len(net.joints), 3, net.history), np.float32))  # do shapes fit?
         return net
 
@@ -60,27 +53,21 @@ def fingerprint(net: ActuatorNet) -> str:
 
 
 def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
-    """The nets of the machine's driven joints; ValueError: nets of another machine or estimator."""
-    wanted = {
-        "machine": machine.name,
-        "rate": machine.rate,
-        "history": machine.history,
-        "velocity_samples": machine.velocity_samples,
-    }
+    """The nets of the machine's driven joints, in their order.
+
+    ValueError: nets of another machine or estimator, or a joint without a net.
+    """
+    wanted: dict[str, Any] = {"machine": machine.name}
+    wanted |= {name: getattr(machine, name) for name in ("rate", "history", "velocity_samples")}
     found = {name: getattr(net, name) for name in wanted}
     require(found == wanted, "actuator", f"nets for {machine.name} with {wanted}", found)
-    return joint_nets(net, [machine.names[i] for i in machine.driven])
-
-
-def joint_nets(net: ActuatorNet, joints: Sequence[str]) -> ActuatorNet:
-    """The nets of some joints, in the order given; ValueError: a joint without a net."""
+    joints = tuple(machine.names[i] for i in machine.driven)
     known = set(joints) <= set(net.joints)
     require(known, "joints", f"nets for {list(joints)}", list(net.joints))
     index = [net.joints.index(name) for name in joints]
-    names = (*ARRAYS, "dead_zones") if isinstance(net, ValveNet) else ARRAYS
-    arrays = {name: getattr(net, name)[index] for name in names}
-    weights = tuple(weight[index] for weight in net.weights)
-    return replace(net, joints=tuple(joints), weights=weights, **arrays)
+    changes: dict[str, Any] = {"joints": joints, "weights": tuple(w[index] for w in net.weights)}
+    changes |= {name: x[index] for name, x in vars(net).items() if isinstance(x, np.ndarray)}
+    return replace(net, **changes)
 
 
 def save_net(path: Path, net: ActuatorNet) -> None:

@@ -14,18 +14,9 @@ from tqdm import tqdm
 
 from brokk_min.actuator import ActuatorNet, append_command, append_sample
 from brokk_min.identification.logs import Log, Samples, join_recordings
-from brokk_min.machine import Array
+from brokk_min.machine import Array, require
 
 HORIZONS = (1, 5, 10, 30)  # s, of the free runs
-
-
-def free_run_step(net: ActuatorNet, history: Array, q: Array, u: Array) -> tuple[Array, Array]:
-    """History and angles [rad] after a tick under `u`; no joint leaves the training's range."""
-    velocity = net.predict(append_command(history, u))
-    low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)
-    q_next = np.clip(q + velocity / net.rate, low, high)
-    history = append_sample(history, u, q_next, net.velocity_samples, 1 / net.rate)
-    return history, q_next
 
 
 def free_run(
@@ -37,34 +28,35 @@ def free_run(
     history before them.
     """
     recorded = samples.joined
-    errors = []
-    for chunk in np.array_split(starts, max(1, math.ceil(len(starts) / 8192))):  # bounds the memory
-        rows = chunk[:, None] + np.arange(1 - net.history, 1)
+    q_error, v_error = np.empty((2, ticks, *recorded.q[starts].shape))
+    parts = max(1, math.ceil(len(starts) / 8192))  # bounds the memory
+    for runs in np.array_split(np.arange(len(starts)), parts):
+        at = starts[runs]
+        rows = at[:, None] + np.arange(1 - net.history, 1)
         history = np.stack([recorded.q[rows], recorded.q_dot[rows], recorded.u[rows - 1]])
         history = history.transpose(1, 3, 0, 2).astype(np.float32)  # (s, n, 3, H)
-        q: Array = recorded.q[chunk]
-        runs = []
-        for at in range(ticks):
-            history, q = free_run_step(net, history, q, recorded.u[chunk + at])
-            after = chunk + at + 1
-            runs.append((q - recorded.q[after], history[..., 1, -1] - recorded.q_dot[after]))
-        errors.append(np.array(runs))  # (ticks, 2, s, n)
-    joined = np.concatenate(errors, axis=2)
-    return joined[:, 0].copy(), joined[:, 1].copy()
+        q: Array = recorded.q[at]
+        for k in range(ticks):
+            u = recorded.u[at + k]
+            velocity = net.predict(append_command(history, u))
+            low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)  # of the training
+            q = np.clip(q + velocity / net.rate, low, high)
+            history = append_sample(history, u, q, net.velocity_samples, 1 / net.rate)
+            q_error[k, runs] = q - recorded.q[at + k + 1]
+            v_error[k, runs] = history[..., 1, -1] - recorded.q_dot[at + k + 1]
+    return q_error, v_error
 
 
 def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
-    """One-step, persistence and free-run errors on recordings, as in the fit JSON.
+    """One-step, persistence and free-run errors of each joint where it moves, as in the fit JSON.
 
-    Each joint is scored where it moves. `one_step_rmse` is the error of the predicted target (see
-    `join_recordings`), `persistence_rmse` that of the newest velocity in the history. Free runs
-    start every `horizon` seconds: `velocity_rmse` is over all samples, `relative_error` this by the
-    joint's rms speed, `position_error_median` over their ends.
-    ValueError: other joints or rate than the nets', or no recording long enough.
+    `one_step_rmse` is the error of the predicted target (see `join_recordings`), `persistence_rmse`
+    that of the newest velocity in the history. Free runs start every `horizon` seconds:
+    `velocity_rmse` is over all samples, `relative_error` this by the joint's rms speed,
+    `position_error_median` over their ends.
+    ValueError: another rate than the nets', or no recording long enough.
     """
-    for name in ("joints", "rate"):
-        if getattr(log, name) != getattr(net, name):
-            raise ValueError(f"{name}: expected {getattr(net, name)}, got {getattr(log, name)}")
+    require(log.rate == net.rate, "rate", f"{net.rate}", log.rate)
     samples = join_recordings(log)
     result = _one_step_scores(net, samples)
     for horizon in tqdm(HORIZONS, desc="score nets", unit="horizon", disable=None):
@@ -86,21 +78,10 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     return result
 
 
-def warnings(scores: Mapping[str, Any]) -> list[str]:
-    """A warning for each net of `score` that is no better than the last velocity again."""
-    return [
-        "{}: expected an error of one step below {persistence_rmse:.4f}, got "
-        "{one_step_rmse:.4f}".format(name, **one)
-        for name, one in scores.items()
-        if one.get("one_step_rmse", 0) > one.get("persistence_rmse", 0)
-    ]
-
-
 def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
     starts = samples.starts(net.history, 1, 1)
-    if not len(starts):
-        got = samples.lengths[:9]
-        raise ValueError(f"log: expected a recording above {net.history + 1} samples, got {got}")
+    wanted = f"a recording above {net.history + 1} samples"
+    require(len(starts) > 0, "log", wanted, samples.lengths[:9])
     error = free_run(net, samples, starts, 1)[0][0] * net.rate
     persistence = samples.joined.q_dot[starts] - samples.target[starts]
     result: dict[str, Any] = {}
@@ -115,3 +96,13 @@ def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
 
 def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(np.square(error))))
+
+
+def warnings(scores: Mapping[str, Any]) -> list[str]:
+    """A warning for each net of `score` that is no better than the last velocity again."""
+    return [
+        f"{name}: expected an error of one step below {one['persistence_rmse']:.4f}, got "
+        f"{one['one_step_rmse']:.4f}"
+        for name, one in scores.items()
+        if one.get("one_step_rmse", 0) > one.get("persistence_rmse", 0)
+    ]

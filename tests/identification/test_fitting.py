@@ -151,5 +151,14 @@ def test_accumulated_loss__is_the_error_of_a_free_run(valve):
         assert float(loss) == pytest.approx(expected[:ticks].mean(), rel=1e-3)
 
 
-def test_decay__falls_to_zero_twice():
-    assert [fitting.decay(step, 8, 12) for step in (0, 4, 8, 10)] == [1.0, 0.5, 0.25, 0.125]
+def test_fit__has_a_learning_rate_that_falls_to_zero_in_each_stage(monkeypatch):
+    rates = []
+
+    class Adam(torch.optim.AdamW):
+        def step(self):
+            rates.append(self.param_groups[0]["lr"])
+            super().step()
+
+    monkeypatch.setattr(torch.optim, "AdamW", Adam)
+    fit(simple_system(0, 2, 60), FitConfig(12, 8, learning_rate=1.0), 0, BROKK_170)
+    assert [rates[step] for step in (0, 4, 8, 10)] == pytest.approx([1.0, 0.5, 0.25, 0.125])

@@ -11,7 +11,6 @@ from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.identification.net_file import (
     fingerprint,
-    joint_nets,
     load_net,
     net_arrays,
     save_net,
@@ -53,16 +52,22 @@ def test_load_net__names_file_and_fault(tmp_path, change, message):
 def test_fingerprint__differs_between_nets():
     net = random_net()
     weights = (net.weights[0] + 1e-6, *net.weights[1:])
-    others = [joint_nets(net, ["j1"]), replace(net, rate=25.0), replace(net, weights=weights)]
+    others = [replace(net, joints=("b", "a", "c")), replace(net, rate=25.0)]
+    others.append(replace(net, weights=weights))
     assert len({fingerprint(other) for other in (net, *others)}) == 4
+
+
+def machine_with(names):
+    joints = [replace(BROKK_170.joints[0], name=x, encoder_node=i) for i, x in enumerate(names)]
+    return replace(BROKK_170, name="some", joints=tuple(joints), q_start=())
 
 
 @pytest.mark.parametrize("net", NETS)
 @pytest.mark.parametrize("joints", [["j2", "j0"], ["j1"]])
-def test_joint_nets__predict_as_they_do_among_others(net, joints):
+def test_select_nets__predict_as_they_do_among_others(net, joints):
     index = [net.joints.index(name) for name in joints]
     history = np.random.default_rng(4).uniform(-1, 1, (20, 3, 3, 13)).astype(np.float32)
-    alone = joint_nets(net, joints)
+    alone = select_nets(machine_with(joints), net)
     assert alone.joints == tuple(joints)
     expected = net.predict(history)[:, index]
     np.testing.assert_allclose(alone.predict(history[:, index]), expected, atol=1e-6)
@@ -76,8 +81,8 @@ def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator(tmp_path
     for name, value in changes.items():
         with pytest.raises(ValueError, match=f"actuator: expected nets for brokk170.*{value!r}"):
             select_nets(BROKK_170, replace(net, **{name: value}))
-    with pytest.raises(ValueError, match=r"joints: expected nets for \['q1', 'q3', 'q4', 'q5'\]"):
-        select_nets(BROKK_170, joint_nets(net, ["q1", "q3"]))
+    with pytest.raises(ValueError, match=r"joints: expected nets for \['j0', 'j9'\]"):
+        select_nets(machine_with(["j0", "j9"]), random_net())
     save_net(tmp_path / "net.npz", replace(net, machine="other"))
     with pytest.raises(ValueError, match=r"net\.npz: actuator: expected nets for brokk170"):
         load_net(tmp_path / "net.npz", BROKK_170)
