@@ -48,7 +48,10 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
         length = int(rng.uniform(0.5, longest) / machine.dt)
         amplitude = rng.uniform(machine.dead_zones.min(), limit)
         if kind == "sine":
-            part = _wide_sine(rng, amplitude, limit, machine.dt * np.arange(length))
+            frequency = np.exp(rng.uniform(np.log(0.05), np.log(4.0)))
+            mean, phase = rng.uniform(-0.3, 0.3) * limit, rng.uniform(0, 2 * np.pi)
+            time = machine.dt * np.arange(length)
+            part = mean + amplitude * np.sin(2 * np.pi * frequency * time + phase)
         elif kind == "step":
             part = np.full(length, rng.choice([-1, 1]) * amplitude)
         elif kind == "holds":
@@ -62,32 +65,25 @@ def rich_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Arra
     return np.concatenate(parts)[:ticks]
 
 
-def _wide_sine(rng: np.random.Generator, amplitude: float, limit: float, time: Array) -> Array:
-    """A sine of 0.05 to 4 Hz about a random mean."""
-    frequency = np.exp(rng.uniform(np.log(0.05), np.log(4.0)))
-    mean = rng.uniform(-0.3, 0.3) * limit
-    phase = rng.uniform(0, 2 * np.pi)
-    return np.asarray(mean + amplitude * np.sin(2 * np.pi * frequency * time + phase))
-
-
 def _starts(
     rng: np.random.Generator, machine: Machine, length: int, limit: float, pauses: bool
 ) -> Array:
-    """Levels up to `limit` for 0.1 to 1 s, each after a pause or a valve barely open, (length,)."""
+    """Levels up to `limit` for 0.1 to 1 s, each after a pause or a valve barely open, (length,).
+
+    In half of the pauses the valve becomes idle; they have the uniform noise of an operator's hand.
+    """
     parts: list[Array] = []
-    noise = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zones.min())  # of an operator's hand
+    noise = rng.choice([0, 1]) * rng.uniform(0, machine.dead_zones.min())
     while sum(map(len, parts)) < length:
         ticks = int(rng.uniform(0.1, 1.0) / machine.dt)
-        parts.append(_pause(rng, machine, noise) if pauses else _barely_open(rng, machine))
+        if pauses:
+            short = np.exp(rng.uniform(np.log(0.05), np.log(3.0)))
+            seconds = 5 * machine.tau_valve_down if rng.random() < 0.5 else short
+            parts.append(noise * rng.uniform(-1, 1, int(seconds / machine.dt)))
+        else:
+            parts.append(_barely_open(rng, machine))
         parts.append(np.full(ticks, rng.uniform(-limit, limit)))
     return np.concatenate(parts)[:length]
-
-
-def _pause(rng: np.random.Generator, machine: Machine, noise: float) -> Array:
-    """A pause, in half of the cases until the valve is idle, with uniform noise."""
-    short = np.exp(rng.uniform(np.log(0.05), np.log(3.0)))
-    seconds = 5 * machine.tau_valve_down if rng.random() < 0.5 else short
-    return noise * rng.uniform(-1, 1, int(seconds / machine.dt))
 
 
 def _barely_open(rng: np.random.Generator, machine: Machine) -> Array:
@@ -133,42 +129,32 @@ def _drive_segments(
 ) -> tuple[Array, Array, Indices]:
     """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves, and its last ticks.
 
-    A segment ends after its commands, or within two counts of a limit, but not within a second.
-    Rich excitation pushes for a second first.
+    Segments start at mid range; if rich, at random angles of the joint, a tenth at either limit.
+    They end after their commands, or within two counts of a limit, but not within a second. Rich
+    excitation pushes for a second first.
     """
-    q, commands = _plan_segments(machine, joint, excitation, rng)
-    rows, near = np.arange(len(joint)), 2 * machine.encoder_step[joint]
-    low, high = machine.column("q_min")[joint] + near, machine.column("q_max")[joint] - near
-    push = machine.rate if excitation == "rich" else 0.0  # ticks at a limit
-    state, angles = plant.reset(machine, q), []
-    for u in commands:
-        angles.append(read_encoder(machine, state.q))
-        state = plant.step(machine, state, u)
-    q = np.array(angles)
-    at_limit = (q[:, rows, joint] < low) | (q[:, rows, joint] > high)
-    late = np.arange(len(q)) > machine.history + machine.rate
-    pushed = at_limit & (np.cumsum(at_limit, axis=0) > push) & late[:, None]
-    return commands, q, np.where(pushed.any(axis=0), pushed.argmax(axis=0), len(q))
-
-
-def _plan_segments(
-    machine: Machine, joint: Indices, excitation: str, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Angles (rows, n) at the start of segments, and commands (T, rows, n).
-
-    Segments start at mid range; if rich, at random angles of `joint[k]`, a tenth at either limit.
-    """
-    low, high, rows = machine.column("q_min"), machine.column("q_max"), np.arange(len(joint))
+    rows, rich = np.arange(len(joint)), excitation == "rich"
+    low, high = machine.column("q_min"), machine.column("q_max")
     q = np.tile((low + high) / 2, (len(joint), 1))
-    if excitation == "rich":
-        low, high = low[joint], high[joint]
+    low, high = low[joint], high[joint]
+    if rich:
         beyond = (high - low) / 8
         q[rows, joint] = np.clip(rng.uniform(low - beyond, high + beyond), low, high)
     ticks = round(MAX_SEGMENT * machine.rate)
     commands = np.zeros((machine.history + ticks, *q.shape))
     for row in rows:
         commands[machine.history :, row, joint[row]] = EXCITATIONS[excitation](rng, machine, ticks)
-    return q, limit_command(machine, commands)
+    commands = limit_command(machine, commands)
+    state, angles = plant.reset(machine, q), []
+    for u in commands:
+        angles.append(read_encoder(machine, state.q))
+        state = plant.step(machine, state, u)
+    q, near = np.array(angles), 2 * machine.encoder_step[joint]
+    at_limit = (q[:, rows, joint] < low + near) | (q[:, rows, joint] > high - near)
+    late = np.arange(len(q)) > machine.history + machine.rate
+    push = machine.rate if rich else 0.0  # ticks at a limit
+    pushed = at_limit & (np.cumsum(at_limit, axis=0) > push) & late[:, None]
+    return commands, q, np.where(pushed.any(axis=0), pushed.argmax(axis=0), len(q))
 
 
 def task_log(
