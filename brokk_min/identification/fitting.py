@@ -4,9 +4,8 @@ The fit minimises the error of one step first, and then the errors that add up o
 the nets on their own outputs, because there a bias adds up and the noise of encoders does not. The
 nets of all joints are trained at once, each on the recordings in which its joint moves.
 
-A net that reads past velocities may learn to go on as they say, whatever the command; it then runs
-away in a free run (NARX: Leontaritis and Billings, 1985). One that reads commands and the newest
-sample alone has to find all in the commands. `FitConfig.newest_only` chooses.
+A net that reads past velocities (NARX: Leontaritis and Billings, 1985) may learn to go on as they
+say, whatever the command. `FitConfig.newest_only` leaves it the commands and the newest sample.
 """
 
 import math
@@ -169,8 +168,7 @@ def initial_weights(data: TrainingSet, config: FitConfig, generator: Generator) 
 
 def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generator) -> Tensor:
     """Newest samples (batch, n) of random windows of each joint."""
-    picks = [torch.randint(len(window), (batch,), generator=generator) for window in windows]
-    drawn = [window[pick] for window, pick in zip(windows, picks, strict=True)]
+    drawn = [ends[torch.randint(len(ends), (batch,), generator=generator)] for ends in windows]
     return torch.tensor(np.stack(drawn, axis=1))
 
 

@@ -176,14 +176,13 @@ def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | No
         if name not in reports:
             result.append(f"{name}: expected commands in the log, got none")
             continue
-        result += motion_warnings(name, reports[name])
-        if machine:
-            result += range_warnings(machine.joints[machine.names.index(name)], reports[name])
+        joint = machine.joints[machine.names.index(name)] if machine else None
+        result += joint_warnings(name, reports[name], joint)
     return result
 
 
-def motion_warnings(name: str, r: JointReport) -> Iterator[str]:
-    """Does a joint move for long enough, and by its commands alone?"""
+def joint_warnings(name: str, r: JointReport, joint: Joint | None) -> Iterator[str]:
+    """Does a joint move for long enough, by its commands alone, and over its range, not beyond?"""
     if r.minutes < LEAST_MINUTES:
         yield f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}"
     if r.follows:
@@ -194,18 +193,15 @@ def motion_warnings(name: str, r: JointReport) -> Iterator[str]:
         wanted = f"commands that explain {LEAST_EXPLAINED:.0%} of its motion, soon after them"
         got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
         yield f"{name}: expected {wanted}, got {got}"
-
-
-def range_warnings(joint: Joint, r: JointReport) -> Iterator[str]:
-    """Is a joint's motion within its range, and over most of it?"""
-    whole = joint.q_max - joint.q_min
-    if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
-        wanted = f"angles of {joint.q_min:g} to {joint.q_max:g}"
-        unit = f"another unit (--map {joint.name}=COLUMN:deg), zero or joint?"
-        yield f"{joint.name}: expected {wanted}, got {r.low:.2f} to {r.high:.2f}: {unit}"
-    elif r.high - r.low < LEAST_RANGE * whole:
-        wanted = f"{LEAST_RANGE:.0%} of its range or more"
-        yield f"{joint.name}: expected {wanted}, got {(r.high - r.low) / whole:.0%}"
+    if joint:
+        whole = joint.q_max - joint.q_min
+        if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
+            wanted = f"angles of {joint.q_min:g} to {joint.q_max:g}"
+            doubt = f"another unit (--map {name}=COLUMN:deg), zero or joint?"
+            yield f"{name}: expected {wanted}, got {r.low:.2f} to {r.high:.2f}: {doubt}"
+        elif r.high - r.low < LEAST_RANGE * whole:
+            wanted = f"{LEAST_RANGE:.0%} of its range or more"
+            yield f"{name}: expected {wanted}, got {(r.high - r.low) / whole:.0%}"
 
 
 def table(reports: Mapping[str, JointReport]) -> list[str]:

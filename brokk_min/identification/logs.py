@@ -52,10 +52,7 @@ def machine_log(machine: Machine, recordings: Iterable[tuple[str, Array, Array]]
 
 
 def velocity_of(q: Array, samples: int, rate: float = RATE) -> Array:
-    """Causal velocity [rad/s] at each row of a recording `q` [rad] (T, n), at rest before it.
-
-    `samples` is the window of `estimate_velocity`, `rate` [Hz] that of the rows.
-    """
+    """`estimate_velocity` [rad/s] of each row of angles [rad] (T, n), at rest before the first."""
     padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
     windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
     return estimate_velocity(windows, samples, 1 / rate)
@@ -65,7 +62,7 @@ class Samples(NamedTuple):
     """The recordings of a log joined, N samples in all; a window must not cross their seams."""
 
     joined: Recording
-    target: Array  # (N, n) rad/s, output of the nets, see `join_recordings`
+    target: Array  # (N, n) rad/s, output of the nets; none for the last sample of a recording
     moves: NDArray[np.bool_]  # (N, n): the joint is `driven` in this recording
     lengths: list[int]  # of the recordings
 
@@ -88,11 +85,7 @@ def driven(recording: Recording) -> NDArray[np.bool_]:
 
 
 def join_recordings(log: Log) -> Samples:
-    """Join the recordings of a log and add the target velocity of each sample.
-
-    The target is the mean velocity of the coming tick, (q(t+dt) - q(t)) / dt. The last sample of a
-    recording has none.
-    """
+    """Join recordings; the target is the velocity of the coming tick, (q(t+dt) - q(t)) / dt."""
     u, q, q_dot = map(np.concatenate, list(zip(*log.recordings, strict=True))[1:])
     target = np.diff(q, axis=0, append=0) * log.rate
     lengths = [len(recording.q) for recording in log.recordings]
@@ -125,10 +118,7 @@ def in_order(log: Log, joints: Sequence[str]) -> Log:
 
 
 def join_logs(logs: Mapping[Path, Log]) -> Log:
-    """One log of several, by their files, with the joints in the order of the first one.
-
-    ValueError: they have other joints, or all are empty.
-    """
+    """One log of several files, in the order of the first; ValueError: other joints, or empty."""
     first = next(iter(logs.values()))
     recordings: list[Recording] = []
     warnings: list[str] = []
@@ -162,11 +152,9 @@ def read_log(
 ) -> Log:
     """Check the table of a file, see `load_table`, and resample it at the rate of `machine`.
 
-    The command is held and averaged over each tick, the angle interpolated. A gap longer than
-    `MAX_GAP` and 2.5 samples cuts a recording, and so does an angle that jumps; rows in which a
-    joint was not read count as a gap. A recording starts at rest; after a gap the rows are left
-    out whose velocity would need samples of the gap. The joints may be others than those of the
-    machine.
+    The command is held and averaged over each tick, the angle interpolated. A recording starts at
+    rest. Gaps and jumps cut it, see `pieces_of`; after a cut the rows are left out whose velocity
+    would need samples from before. The joints may be others than those of the machine.
     ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
     with expected(path, "a log"):

@@ -91,9 +91,10 @@ def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str
 def pieces_of(
     time: Array, q: Array, rate: float, fastest: Array, repeats: Sequence[float]
 ) -> tuple[list[Rows], NDArray[np.bool_]]:
-    """Rows of each piece of a recording without unread angles, gaps and jumps, and wrong angles.
+    """Rows of each piece of a recording, and wrong angles (T, n): unread, or at another zero.
 
-    Wrong ones (T, n) were not read, or begin another zero.
+    Such an angle cuts a recording, and so does a gap, in time or of rows with an unread angle,
+    that is longer than `MAX_GAP` and 2.5 samples.
     """
     each = list(zip(q.T, fastest, repeats, strict=True))
     wrong = np.stack([unread(time, *joint) for joint in each], axis=1)

@@ -4,30 +4,20 @@ import numpy as np
 import pytest
 from helpers_machines import constant_net, line
 
-from brokk_min.identification.logs import Log, Recording, velocity_of
+from brokk_min.identification.logs import Log, Recording
 from brokk_min.identification.validation import score, warnings
 
 
-def test_score__compares_one_step_with_the_target_of_the_fit_by_hand():
-    """q = 0.1 t^2: in the tick from t it moves at 0.2 t + 0.005 rad/s."""
-    time = np.arange(60)[:, None] / 20
-    q = 0.1 * time**2
-    recording = Recording("x", np.zeros((60, 1)), q, velocity_of(q, 4))
-    log = Log(("a",), (recording, recording._replace(name="y", q=q + 9.0)))
-    result = score(constant_net([0.2], ("a",)), log)["a"]
-    at = time[13:59]  # samples with 13 before and one after them
-    expected = np.sqrt(np.mean((0.2 - (0.2 * at + 0.005)) ** 2))
-    assert result["one_step_rmse"] == pytest.approx(expected, abs=1e-5)
-    # the slope through 4 samples lags by 1.5 ticks, the target leads by half a tick: 0.2 * 2 / 20
-    assert result["persistence_rmse"] == pytest.approx(0.02, abs=1e-6)
-
-
-def test_score__runs_freely_within_recordings_by_hand():
+def test_score__is_that_of_the_last_velocity_and_of_free_runs_by_hand():
     """Velocity grows by 0.2 rad/s each second: 0.01 a tick. The recordings are far apart."""
     time = np.arange(60)[:, None] / 20
     one = Recording("", 0 * time, 0.1 * time**2, 0.2 * time)
-    recordings = tuple(one._replace(q=one.q + far) for far in (0.0, 50.0, -80.0))
-    result = score(constant_net([0.0], ("a",)), Log(("a",), recordings))["a"]
+    log = Log(("a",), tuple(one._replace(q=one.q + far) for far in (0.0, 50.0, -80.0)))
+    result = score(constant_net([0.2], ("a",)), log)["a"]
+    at = time[13:59]  # samples with 13 before and one after them: target 0.2 t + 0.005 rad/s
+    expected = np.sqrt(np.mean((0.2 - (0.2 * at + 0.005)) ** 2))
+    assert result["one_step_rmse"] == pytest.approx(expected, abs=1e-5)
+    result = score(constant_net([0.0], ("a",)), log)["a"]
     assert result["persistence_rmse"] == pytest.approx(0.005, abs=1e-9)
     # 2 runs of 1 s in each recording, from samples 13 and 33: 0.1 ((t + 1)^2 - t^2)
     starts = np.array([13, 33]) / 20
@@ -54,16 +44,12 @@ def test_score__counts_each_joint_where_it_moves():
     assert horizons == {"a": set(), "b": set(), "c": {"1"}}
 
 
-@pytest.mark.parametrize(
-    ("log", "message"),
-    [
-        (Log(("a",), (line("x", 0.0, 0.1, 40),), 10.0), "rate: expected 20.0, got 10.0"),
-        (Log(("a",), (line("x", 0.0, 0.1, 14),)), r"above 14 samples, got \[14\]"),
-    ],
-)
-def test_score__refuses_a_log_of_another_kind(log, message):
-    with pytest.raises(ValueError, match=message):
-        score(constant_net([0.2], ("a",)), log)
+def test_score__refuses_a_log_of_another_rate_or_without_a_whole_history():
+    net = constant_net([0.2], ("a",))
+    with pytest.raises(ValueError, match=r"rate: expected 20\.0, got 10\.0"):
+        score(net, Log(("a",), (line("x", 0.0, 0.1, 40),), 10.0))
+    with pytest.raises(ValueError, match=r"above 14 samples, got \[14\]"):
+        score(net, Log(("a",), (line("x", 0.0, 0.1, 14),)))
 
 
 def test_warnings__name_nets_no_better_than_the_last_velocity():
