@@ -33,10 +33,8 @@ ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_
 def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = "") -> ActuatorNet:
     """Fit the nets of each joint to a log. Paper: Sec. 3.3 (MSE, Adam)
 
-    The same `seed` gives the same bits on one computer. `machine` has the history, the window of
-    the estimator that made the velocities of `log`, and the dead zones. `name` is its name in the
-    file; it is empty for a log with other joints, which gets one net for each joint that reads the
-    commands as they are.
+    The same `seed` gives the same bits on one computer. `name` is that of `machine`; it is empty
+    for a log with other joints, each of which gets one net that reads the commands as they are.
     ValueError: a joint that never moves long enough, or weights that are not finite at the end.
     """
     if not (name and config.valve):

@@ -206,13 +206,12 @@ def joint_warnings(name: str, r: JointReport, joint: Joint | None) -> Iterator[s
 
 def table(reports: Mapping[str, JointReport]) -> list[str]:
     """Lines of what a log tells, and fields of `Joint` by it, to copy into a machine."""
-    lines = ["joint        minutes sign explained delay [s]  gain up  down"]
+    lines, fields = ["joint        minutes sign explained delay [s]  gain up  down"], []
     for name, r in reports.items():
         numbers = f"{r.minutes:7.1f} {r.sign:+4d} {r.explained:9.0%} {r.delay:9.2f}"
         lines.append(f"{name:12} {numbers}  {r.gain[0]:<8.3f} {r.gain[1]:.3f}")
-    for name, r in reports.items():
         limits = f"q_min={r.low:.3f}, q_max={r.high:.3f}"
         speeds = "q_dot_up={:.3f}, q_dot_down={:.3f}".format(*r.fastest)
         zones = "dead_zone=({:.3f}, {:.3f})".format(*r.dead_zone)
-        lines.append(f'Joint("{name}", {limits}, {speeds}, {zones}, ...)')
-    return lines
+        fields.append(f'Joint("{name}", {limits}, {speeds}, {zones}, ...)')
+    return lines + fields

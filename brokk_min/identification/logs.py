@@ -98,15 +98,13 @@ def split(log: Log) -> tuple[Log, Log]:
 
     ValueError: no two recordings drive the same joints.
     """
-    groups: dict[tuple[bool, ...], list[int]] = {}
-    for i, recording in enumerate(log.recordings):
-        groups.setdefault(tuple(driven(recording).tolist()), []).append(i)
-    held_out = {i for group in groups.values() if len(group) > 1 for i in group[::10]}
+    keys = [driven(recording).tobytes() for recording in log.recordings]
+    scored = [keys.count(key) > 1 and keys[:i].count(key) % 10 == 0 for i, key in enumerate(keys)]
     wanted = "two or more (column run) that drive the same joints, or --test"
-    require(len(held_out) > 0, "recordings", wanted, len(log.recordings))
-    kept = (one for i, one in enumerate(log.recordings) if i not in held_out)
-    scored = (log.recordings[i] for i in sorted(held_out))
-    return log._replace(recordings=tuple(kept)), log._replace(recordings=tuple(scored))
+    require(any(scored), "recordings", wanted, len(log.recordings))
+    fitted = tuple(log.recordings[i] for i, held_out in enumerate(scored) if not held_out)
+    tested = tuple(log.recordings[i] for i, held_out in enumerate(scored) if held_out)
+    return log._replace(recordings=fitted), log._replace(recordings=tested)
 
 
 def in_order(log: Log, joints: Sequence[str]) -> Log:

@@ -53,10 +53,7 @@ def fingerprint(net: ActuatorNet) -> str:
 
 
 def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
-    """The nets of the machine's driven joints, in their order.
-
-    ValueError: nets of another machine or estimator, or a joint without a net.
-    """
+    """The nets of the machine's driven joints; ValueError: of another machine, or not of all."""
     wanted: dict[str, Any] = {"machine": machine.name}
     wanted |= {name: getattr(machine, name) for name in ("rate", "history", "velocity_samples")}
     found = {name: getattr(net, name) for name in wanted}
@@ -77,10 +74,7 @@ def save_net(path: Path, net: ActuatorNet) -> None:
 
 
 def load_net(path: Path, machine: Machine | None = None) -> ActuatorNet:
-    """Read nets that `save_net` wrote; for a `machine`: those of its driven joints.
-
-    ValueError as in `net_from_arrays`, or nets that are not for the machine.
-    """
+    """Read nets that `save_net` wrote; for a `machine`: `select_nets` of them."""
     with expected(path, "actuator nets"):
         net: ActuatorNet = net_from_arrays(path, *load_arrays(path, KIND))
         return select_nets(machine, net) if machine else net

@@ -38,14 +38,12 @@ def test_fit__learns_a_simple_system():
     log = simple_system(0, 25)
     net = fit(log, FitConfig(steps=500, batch_size=256), 0, BROKK_170)
     assert not isinstance(net, ValveNet)  # no machine, no dead zones
-    unseen = simple_system(1, 6)
-    result = score(net, unseen)
-    for j, name in enumerate(net.joints):
+    result = score(net, simple_system(1, 6))
+    for name in net.joints:
         assert result[name]["one_step_rmse"] < 0.35 * result[name]["persistence_rmse"], result
-        speed = np.sqrt(np.mean(np.concatenate([r.q_dot[:, j] for r in unseen.recordings]) ** 2))
         for horizon in ("1", "5", "10"):
             run = result[name]["free_run"][horizon]
-            assert run["velocity_rmse"] < 0.25 * speed, (name, horizon)
+            assert run["relative_error"] < 0.25, (name, horizon)
             assert run["position_error_median"] < 0.1, (name, horizon)
 
 
