@@ -167,8 +167,9 @@ def read_log(
         for i in np.argsort(first):
             run, rows = str(unique[i]), np.flatnonzero(number == i)
             time, angles = table["time"][rows], q[rows]
-            repeats = check_run(run, time, angles, machine.rate, joints)
-            pieces, wrong[rows] = pieces_of(time, angles, machine.rate, fastest, repeats)
+            if len(rows) > 1:
+                check_run(run, time, angles, machine.rate, joints)
+            pieces, wrong[rows] = pieces_of(time, angles, machine.rate, fastest)
             for part, piece in enumerate(pieces):
                 skipped = machine.velocity_samples - 1 if part else 0
                 sampled = [x[skipped:] for x in _resample(time, u[rows], angles, piece, machine)]

@@ -38,14 +38,14 @@ def rows_per_value(q: Array) -> float:
     return float(np.median(np.diff(np.flatnonzero(step)))) if repeats else 1.0
 
 
-def jumps(time: Array, q: Array, fastest: float, repeats: float) -> NDArray[np.bool_]:
+def jumps(time: Array, q: Array, fastest: float) -> NDArray[np.bool_]:
     """Which angles (T,) are farther from the one before than any motion of the joint.
 
     `fastest` [rad/s] is the machine's, 0 if unknown; motion that lasts may be faster, and a noisy
-    sensor may have steps of several times its usual ones. `repeats` as `rows_per_value`.
+    sensor may have steps of several times its usual ones.
     """
     result = np.zeros(len(q), bool)
-    rows = np.flatnonzero(np.append(True, (np.diff(q) != 0) | (repeats == 1)))
+    rows = np.flatnonzero(np.append(True, (np.diff(q) != 0) | (rows_per_value(q) == 1)))
     if len(rows) > 1:
         step, dt = np.diff(q[rows]), np.diff(time[rows])
         dt = np.maximum(dt, np.median(dt))
@@ -57,23 +57,18 @@ def jumps(time: Array, q: Array, fastest: float, repeats: float) -> NDArray[np.b
     return result
 
 
-def unread(time: Array, q: Array, fastest: float, repeats: float) -> NDArray[np.bool_]:
+def unread(time: Array, q: Array, fastest: float) -> NDArray[np.bool_]:
     """Which angles (T,) were not read: what stands between two jumps for less than `MAX_GAP`."""
-    jump = jumps(time, q, fastest, repeats)
+    jump = jumps(time, q, fastest)
     if not jump.any():
         return jump
     between = np.cumsum(jump)  # number of jumps up to each row
-    shortest = max(3 * repeats, MAX_GAP / float(np.median(np.diff(time))))
+    shortest = max(3 * rows_per_value(q), MAX_GAP / float(np.median(np.diff(time))))
     return np.asarray(np.bincount(between)[between] < shortest)
 
 
-def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str]) -> list[float]:
-    """`rows_per_value` of a recording; ValueError: it cannot be one at `rate` [Hz].
-
-    Its time does not rise or has too few samples, or a sensor is slower than `rate`.
-    """
-    if len(time) < 2:
-        return [1.0] * len(joints)
+def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str]) -> None:
+    """ValueError: `time` does not rise or has too few samples, or sensors are below `rate` [Hz]."""
     step = np.diff(time)
     got = f"a step of {step.min():.6g} at {time[step.argmin()]:.6g}"
     require(step.min() > 0, f"run {run}, column time", "stamps that rise", got)
@@ -81,26 +76,25 @@ def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str
     wanted = f"s, at {rate:g} Hz, the machine's rate (--machine), or more"
     got = f"{1 / median:.3g} Hz (if it is in ms: --map time=COLUMN:ms)"
     require(median <= 1.05 / rate, f"run {run}, column time", wanted, got)
-    repeats = [rows_per_value(angle) for angle in q.T]
-    slow = [name for name, k in zip(joints, repeats, strict=True) if k * median > 1.05 / rate]
-    got = f"a new one every {max(repeats):g} rows: {1 / (max(repeats) * median):.3g} Hz"
+    rows = [rows_per_value(angle) for angle in q.T]
+    slow = [name for name, k in zip(joints, rows, strict=True) if k * median > 1.05 / rate]
+    got = f"a new one every {max(rows):g} rows: {1 / (max(rows) * median):.3g} Hz"
     require(not slow, f"run {run}, q of {brief(slow)}", f"new angles at {rate:g} Hz or more", got)
-    return repeats
 
 
 def pieces_of(
-    time: Array, q: Array, rate: float, fastest: Array, repeats: Sequence[float]
+    time: Array, q: Array, rate: float, fastest: Array
 ) -> tuple[list[Rows], NDArray[np.bool_]]:
     """Rows of each piece of a recording, and wrong angles (T, n): unread, or at another zero.
 
     Such an angle cuts a recording, and so does a gap, in time or of rows with an unread angle,
     that is longer than `MAX_GAP` and 2.5 samples.
     """
-    each = list(zip(q.T, fastest, repeats, strict=True))
-    wrong = np.stack([unread(time, *joint) for joint in each], axis=1)
+    each = list(zip(q.T, fastest, strict=True))
+    wrong = np.stack([unread(time, angle, speed) for angle, speed in each], axis=1)
     good = np.flatnonzero(~wrong.any(axis=1))
     gap = np.diff(time[good]) > max(MAX_GAP, 2.5 / rate)
-    wrong[good] = np.stack([jumps(time[good], angle[good], *of) for angle, *of in each], axis=1)
+    wrong[good] = np.stack([jumps(time[good], angle[good], speed) for angle, speed in each], axis=1)
     pieces = np.split(good, np.flatnonzero(gap | wrong[good[1:]].any(axis=1)) + 1)
     return [piece for piece in pieces if len(piece)], wrong
 
