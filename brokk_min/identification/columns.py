@@ -55,20 +55,20 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
         table = load_arrays(path)[1]
     else:
         table = read_ros(path, *topics)
-    sources = {"run": ("", 1.0)} | {name: (name, 1.0) for name in table} | mapped
-    joints = dict.fromkeys(name[2:] for name in sources if name.startswith("u_"))
+    joints = dict.fromkeys(name[2:] for name in (*table, *mapped) if name.startswith("u_"))
     joints |= dict.fromkeys(name[2:] for name in mapped if name.startswith("q_"))
     require(len(joints) > 0, "columns", "u_<joint> (--map u_NAME=COLUMN:UNIT)", brief(list(table)))
     names = ["time", *(f"{kind}_{joint}" for kind in "uq" for joint in joints)]
-    needed = dict.fromkeys([*names, *mapped])
-    missing = [name for name in needed if sources.get(name, ("",))[0] not in table]
-    wanted = f"{brief(missing)} (--map {missing[0]}=COLUMN:UNIT)" if missing else ""
-    require(not missing, "columns", wanted, brief(list(table)))
+    sources = {name: (name, 1.0) for name in names} | mapped
+    missing = {name: column for name, (column, _) in sources.items() if column not in table}
+    if missing:
+        wanted = f"{brief([*missing.values()])} (--map {next(iter(missing))}=COLUMN:UNIT)"
+        raise ValueError(f"columns: expected {wanted}, got {brief(list(table))}")
     result = {}
     for name in names:
         column, factor = sources[name]
         result[name] = _numbers(path, name, np.ravel(table[column]), factor)
-    run = np.asarray(table.get(sources["run"][0], path.stem)).astype(str)
+    run = np.asarray(table.get(sources.get("run", ("run", 1.0))[0], path.stem)).astype(str)
     return {"run": np.broadcast_to(run, len(result["time"]))} | result
 
 

@@ -104,6 +104,6 @@ def left_out(wrong: NDArray[np.bool_], q: Array, joints: Sequence[str]) -> Itera
     for name, bad, angle in zip(joints, wrong.T, q.T, strict=True):
         if bad.any():
             row = bad.argmax()
-            got = f"a jump to {angle[row]:.4g}, as in {bad.sum() - 1} other rows"
-            what = "such rows are left out or begin a new recording"
-            yield f"row {row + 2}: expected motion of q_{name}, got {got}: {what}"
+            what = f"which is left out or begins a new recording (such rows: {bad.sum()})"
+            got = f"a jump to {angle[row]:.4g}, {what}"
+            yield f"row {row + 2}: expected motion of q_{name}, got {got}"

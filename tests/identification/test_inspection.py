@@ -67,6 +67,13 @@ def test_inspect__finds_what_is_true(name):
     assert (report.low, report.high) == pytest.approx((angles.min(), angles.max()))
 
 
+def test_inspect__has_the_fastest_motions_of_the_log():
+    """Gains of 0.5 and 0.3 from dead zones of 0.12 and 0.2 on; commands of 0.6 held for 3 s."""
+    held = np.tile(np.repeat([0.6, 0.0, -0.6, 0.0], 60), 16)
+    report = inspect(log_of(record("boom", held)))["boom"]
+    assert report.fastest == pytest.approx((0.5 * (0.6 - 0.12), 0.3 * (0.6 - 0.2)), rel=0.03)
+
+
 def test_inspect__leaves_out_joints_without_commands_and_directions_without_motion():
     still = record("boom", holds())._replace(q=np.zeros((4000, 2)))
     report = inspect(log_of(still))["boom"]
@@ -78,13 +85,6 @@ def test_inspect__leaves_out_joints_without_commands_and_directions_without_moti
     assert "arm: expected commands in the log, got none" in warnings(log, upwards, None)
     short = Recording("", *(x[5:9] for x in record("boom", holds())[1:]))  # 0.2 s
     assert np.isfinite(inspect(log_of(short))["boom"].gain).all()
-
-
-def test_inspect__has_the_fastest_motions_of_the_log():
-    """Gains of 0.5 and 0.3 from dead zones of 0.12 and 0.2 on; commands of 0.6 held for 3 s."""
-    held = np.tile(np.repeat([0.6, 0.0, -0.6, 0.0], 60), 16)
-    report = inspect(log_of(record("boom", held)))["boom"]
-    assert report.fastest == pytest.approx((0.5 * (0.6 - 0.12), 0.3 * (0.6 - 0.2)), rel=0.03)
 
 
 def test_inspect__names_recordings_in_which_angles_fall_under_positive_commands():

@@ -149,8 +149,8 @@ def test_read_log__leaves_out_readings_that_no_motion_explains(tmp_path, wrong, 
     np.testing.assert_allclose(log.recordings[0].u, sound.recordings[0].u[1:-1], atol=1e-12)
     assert (speed_of(log) < speed_of(sound) + 0.05).all()
     assert len(log.warnings) == 2
-    told = f"log.npz: row 2: expected motion of q_a, got a jump to {wrong:.4g}, as in 3 other rows"
-    assert told in log.warnings[0]
+    told = f"log.npz: row 2: expected motion of q_a, got a jump to {wrong:.4g}, which is left out"
+    assert told in log.warnings[0] and log.warnings[0].endswith("(such rows: 4)")
     assert "log.npz: row 62: expected motion of q_b" in log.warnings[1]
 
 
