@@ -68,7 +68,8 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
     for name in names:
         column, factor = sources[name]
         result[name] = _numbers(path, name, np.ravel(table[column]), factor)
-    run = np.asarray(table.get(sources.get("run", ("run", 1.0))[0], path.stem)).astype(str)
+    column, _ = sources.get("run", ("run", 1.0))
+    run = np.asarray(table.get(column, path.stem)).astype(str)
     return {"run": np.broadcast_to(run, len(result["time"]))} | result
 
 
@@ -83,10 +84,10 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
         values = numbers(path, name, values)
     if name == "time" and factor != 1:
         values = values - values[:1]  # keeps its digits
-    values = np.asarray(values, float) * factor
+    result: Array = np.asarray(values * factor, float)
     limit = 1.0 if name.startswith("u_") else LARGEST
-    for row in np.flatnonzero(~(np.abs(values) <= limit)):  # also where it is nan
+    for row in np.flatnonzero(~(np.abs(result) <= limit)):  # also where it is nan
         unit = f" (per cent: --map {name}=COLUMN:percent)" if limit == 1.0 else ""
         wanted = f"-{limit:g} to {limit:g}{unit}"
-        raise ValueError(f"row {row + 2}, column {name}: expected {wanted}, got {values[row]}")
-    return np.asarray(values)
+        raise ValueError(f"row {row + 2}, column {name}: expected {wanted}, got {result[row]}")
+    return result
