@@ -87,6 +87,9 @@ def test_tick__survives_an_operator_that_fails_at_once(world):
     world.drive.operator = raises(OSError("unplugged"))
     assert world.drive.tick()
     assert world.drive.reason == "error (OSError: unplugged)" and not world.drive.gate.armed_once
+    world.drive.operator = world.operator
+    world.run(0.3)
+    assert world.drive.gate.driving and world.drive.reason == ""
 
 
 def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
