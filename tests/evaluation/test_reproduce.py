@@ -96,7 +96,7 @@ def test_reproduce__answers_each_sentence_of_the_paper_on_one_page(folder, resul
     sentences = [claim["paper"] for claim in results["claims"]]
     assert sentences == [text["paper"] for text in TEXTS.values()]
     page = (folder / "report.html").read_text()
-    assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 7
+    assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 8
     assert page.count("<blockquote>") == len(TEXTS)
 
 
