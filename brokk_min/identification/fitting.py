@@ -9,12 +9,12 @@ say, whatever the command. `FitConfig.newest_only` leaves it the commands and th
 """
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Generator, Tensor
 from tqdm import tqdm
 
@@ -23,10 +23,12 @@ from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
 from brokk_min.identification.logs import Log, join_recordings
+from brokk_min.identification.readings import Rows
 from brokk_min.machine import Array, Machine, require
 
 __all__ = ["PAPER_RECIPE", "FitConfig", "fit"]
 
+tensor = partial(torch.tensor, dtype=torch.float32)
 ARRAYS = ("input_mean", "input_scale", "output_low", "output_high", "q_low", "q_high")  # of nets
 
 
@@ -41,7 +43,7 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
         config = replace(config, valve=False, members=1)
     index = [machine.names.index(joint) for joint in log.joints] if name else []
     zones = machine.dead_zones[index].astype(np.float32)
-    data = training_set(log, config, machine, zones)
+    data = TrainingSet(log, config, machine, zones)
     seeds = range(seed * config.members, (seed + 1) * config.members)
     members = [train(data, config, one) for one in seeds]
     fields: dict[str, Any] = {
@@ -62,62 +64,43 @@ def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = ""
     return NetEnsemble(**fields, dead_zones=zones)
 
 
-@dataclass(frozen=True)
 class TrainingSet:
-    """Samples of each joint, windows of them and their statistics, float32."""
+    """Samples of n joints, recordings joined, windows of them and their statistics, float32."""
 
-    samples: Tensor  # angle, velocity, command, recordings joined: (n, 3, N)
-    target: Tensor  # velocity that the nets should say at each sample [rad/s], (n, N)
-    windows: list[NDArray[np.intp]]  # newest samples of each joint's windows
-    long_windows: list[NDArray[np.intp]]  # those with `rollout` samples after them
-    zones: Tensor | None  # dead zones (n, 2); None: the nets read the commands as they are
-    history: int  # samples of a window
-    estimator: Tensor  # weights of the velocity estimator
-    input_mean: Tensor  # (n, I)
-    input_scale: Tensor  # (n, I)
-    reads: Tensor  # 1 for inputs that the nets read, (I,)
-    output_low: Tensor  # rad/s, (n,)
-    output_high: Tensor  # rad/s, (n,)
-    q_low: Tensor  # rad, (n,)
-    q_high: Tensor  # rad, (n,)
-    rate: float  # of the samples [Hz]
+    def __init__(self, log: Log, config: FitConfig, machine: Machine, zones: Array) -> None:
+        """ValueError: a joint that never moves."""
+        joined, H, window = join_recordings(log), machine.history, machine.velocity_samples
+        self.history, self.rate = H, log.rate
+        self.windows = joined.windows(H, 1)  # newest samples of each joint's windows
+        self.long_windows = joined.windows(H, config.rollout)  # with `rollout` samples after them
+        targets = [target[at] for target, at in zip(joined.target.T, self.windows, strict=True)]
+        for name, target in zip(log.joints, targets, strict=True):
+            wanted = f"a recording of {H + 1} samples or more in which it moves"
+            require(len(np.unique(target)) > 1, f"joint {name}", wanted, "none")
+        signals = np.stack([joined.q, joined.q_dot, joined.u], dtype=np.float32)
+        self.samples = tensor(signals.transpose(2, 0, 1))  # angle, velocity, command, (n, 3, N)
+        self.target = tensor(joined.target.T)  # what the nets should say there [rad/s], (n, N)
+        self.q_low, self.q_high = tensor(joined.q.min(axis=0)), tensor(joined.q.max(axis=0))  # (n,)
+        low, high = (np.array([f(target) for target in targets]) for f in (np.min, np.max))
+        margin = 0.05 * (high - low) + 1e-6  # rad/s
+        self.output_low, self.output_high = tensor(low - margin), tensor(high + margin)  # (n,)
+        self.zones = tensor(zones) if config.valve else None  # (n, 2); none: commands as they are
+        moments = input_moments(signals, self.windows, zones if config.valve else None)
+        mean, std = (np.repeat(part, H, axis=1) for part in moments)
+        self.input_mean, self.input_scale = tensor(mean), tensor(np.where(std > 1e-9, std, 1.0))
+        self.reads = torch.ones(mean.shape[1])  # 1 for inputs that the nets read, (I,)
+        if config.newest_only:
+            self.reads.view(-1, H)[:2, :-1] = 0
+        t = (np.arange(window) - (window - 1) / 2) / log.rate
+        self.estimator = tensor(t / (t @ t))  # weights of the velocity estimator
 
 
-def training_set(log: Log, config: FitConfig, machine: Machine, zones: Array) -> TrainingSet:
-    """Windows in which a joint moves, and their statistics; ValueError: one that never moves."""
-    H = machine.history
-    joined = join_recordings(log)
-    windows = joined.windows(H, 1)
-    targets = [target[at] for target, at in zip(joined.target.T, windows, strict=True)]
-    for name, target in zip(log.joints, targets, strict=True):
-        moves = len(target) > 0 and np.ptp(target) > 0
-        wanted = f"a recording of {H + 1} samples or more in which it moves"
-        require(bool(moves), f"joint {name}", wanted, "none")
-    _, u, q, q_dot = joined.joined
-    signals = np.stack([q, q_dot, u], dtype=np.float32)
+def input_moments(signals: Array, windows: list[Rows], zones: Array | None) -> list[Array]:
+    """Mean and deviation of what nets read of samples (3, N, n) in the windows, (n, rows)."""
     rows = signals[..., None].transpose(1, 2, 0, 3)  # each sample as a history of one: (N, n, 3, 1)
-    read = valve_inputs(rows, zones) if config.valve else rows[..., 0]  # (N, n, rows)
-    moments = [(read[at, j].mean(axis=0), read[at, j].std(axis=0)) for j, at in enumerate(windows)]
-    mean, std = (np.repeat(np.array(part), H, axis=1) for part in zip(*moments, strict=True))
-    low, high = (np.array([f(target) for target in targets]) for f in (np.min, np.max))
-    margin = 0.05 * (high - low) + 1e-6  # rad/s
-    t = (np.arange(machine.velocity_samples) - (machine.velocity_samples - 1) / 2) / log.rate
-    reads = np.ones((read.shape[-1], H))
-    if config.newest_only:
-        reads[:2, :-1] = 0
-    arrays = (reads.ravel(), mean, np.where(std > 1e-9, std, 1.0), low - margin, high + margin)
-    tensors = (torch.tensor(x).float() for x in (*arrays, q.min(axis=0), q.max(axis=0)))
-    return TrainingSet(
-        samples=torch.tensor(signals.transpose(2, 0, 1)),
-        target=torch.tensor(joined.target.T).float(),
-        windows=windows,
-        long_windows=joined.windows(H, config.rollout),
-        zones=torch.tensor(zones) if config.valve else None,
-        history=H,
-        estimator=torch.tensor(t / (t @ t)).float(),
-        rate=log.rate,
-        **dict(zip(("reads", *ARRAYS), tensors, strict=True)),
-    )
+    read = rows[..., 0] if zones is None else valve_inputs(rows, zones)  # (N, n, rows)
+    parts = [read[at, j] for j, at in enumerate(windows)]
+    return [np.array([f(part, axis=0) for part in parts]) for f in (np.mean, np.std)]
 
 
 def train(data: TrainingSet, config: FitConfig, seed: int) -> tuple[Array, ...]:
@@ -138,8 +121,8 @@ def train(data: TrainingSet, config: FitConfig, seed: int) -> tuple[Array, ...]:
     for steps, rate, windows, batch, ticks in stages:
         for step in tqdm(range(steps), desc=f"fit nets, {ticks} ticks", unit="step", disable=None):
             optimizer.param_groups[0]["lr"] = 0.5 * rate * (1 + math.cos(math.pi * step / steps))
-            at = draw_windows(windows, batch, generator)
-            loss = accumulated_loss(data, weights, at, ticks)
+            drawn = [at[torch.randint(len(at), (batch,), generator=generator)] for at in windows]
+            loss = accumulated_loss(data, weights, torch.tensor(np.stack(drawn, axis=1)), ticks)
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
@@ -154,20 +137,17 @@ def initial_weights(data: TrainingSet, config: FitConfig, generator: Generator) 
     Those of inputs that the nets do not read are zero, and stay so.
     """
     n, inputs = data.input_mean.shape
-    sizes = (inputs, config.hidden, config.hidden, 1)
-    fan_in = (int(data.reads.sum()), config.hidden, config.hidden)
+    hidden, read = config.hidden, int(data.reads.sum())
     weights = []
-    for rows, columns, size in zip(sizes[:-1], sizes[1:], fan_in, strict=True):
-        w = (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * math.sqrt(6 / size)
+    for rows, columns, fan_in in (
+        (inputs, hidden, read),
+        (hidden, hidden, hidden),
+        (hidden, 1, hidden),
+    ):
+        w = (torch.rand(n, rows, columns, generator=generator) * 2 - 1) * math.sqrt(6 / fan_in)
         weights += [w, torch.zeros(n, columns)]
     weights[0] *= data.reads[:, None]
     return [weight.requires_grad_() for weight in weights]
-
-
-def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generator) -> Tensor:
-    """Newest samples (batch, n) of random windows of each joint."""
-    drawn = [ends[torch.randint(len(ends), (batch,), generator=generator)] for ends in windows]
-    return torch.tensor(np.stack(drawn, axis=1))
 
 
 def accumulated_loss(data: TrainingSet, weights: list[Tensor], at: Tensor, ticks: int) -> Tensor:

@@ -59,11 +59,13 @@ def velocity_of(q: Array, samples: int, rate: float = RATE) -> Array:
 
 
 class Samples(NamedTuple):
-    """The recordings of a log joined, N samples in all; a window must not cross their seams."""
+    """The recordings of a log joined, N samples (N, n); a window must not cross their seams."""
 
-    joined: Recording
-    target: Array  # (N, n) rad/s, output of the nets; none for the last sample of a recording
-    moves: NDArray[np.bool_]  # (N, n): the joint is `driven` in this recording
+    u: Array  # [-1, 1]
+    q: Array  # rad
+    q_dot: Array  # rad/s
+    target: Array  # rad/s, output of the nets; none for the last sample of a recording
+    moves: NDArray[np.bool_]  # the joint is `driven` in this recording
     lengths: list[int]  # of the recordings
 
     def starts(self, before: int, after: int, step: int) -> Rows:
@@ -86,11 +88,10 @@ def driven(recording: Recording) -> NDArray[np.bool_]:
 
 def join_recordings(log: Log) -> Samples:
     """Join recordings; the target is the velocity of the coming tick, (q(t+dt) - q(t)) / dt."""
-    u, q, q_dot = map(np.concatenate, list(zip(*log.recordings, strict=True))[1:])
-    target = np.diff(q, axis=0, append=0) * log.rate
     lengths = [len(recording.q) for recording in log.recordings]
-    moves = [driven(recording) for recording in log.recordings]
-    return Samples(Recording("", u, q, q_dot), target, np.repeat(moves, lengths, axis=0), lengths)
+    moves = np.repeat([driven(recording) for recording in log.recordings], lengths, axis=0)
+    u, q, q_dot = map(np.concatenate, list(zip(*log.recordings, strict=True))[1:])
+    return Samples(u, q, q_dot, np.diff(q, axis=0, append=0) * log.rate, moves, lengths)
 
 
 def split(log: Log) -> tuple[Log, Log]:
@@ -99,12 +100,13 @@ def split(log: Log) -> tuple[Log, Log]:
     ValueError: no two recordings drive the same joints.
     """
     keys = [driven(recording).tobytes() for recording in log.recordings]
-    scored = [keys.count(key) > 1 and keys[:i].count(key) % 10 == 0 for i, key in enumerate(keys)]
+    tested, fitted = [], []
+    for i, (key, recording) in enumerate(zip(keys, log.recordings, strict=True)):
+        held_out = keys.count(key) > 1 and keys[:i].count(key) % 10 == 0
+        (tested if held_out else fitted).append(recording)
     wanted = "two or more (column run) that drive the same joints, or --test"
-    require(any(scored), "recordings", wanted, len(log.recordings))
-    fitted = tuple(log.recordings[i] for i, held_out in enumerate(scored) if not held_out)
-    tested = tuple(log.recordings[i] for i, held_out in enumerate(scored) if held_out)
-    return log._replace(recordings=fitted), log._replace(recordings=tested)
+    require(len(tested) > 0, "recordings", wanted, len(fitted))
+    return log._replace(recordings=tuple(fitted)), log._replace(recordings=tuple(tested))
 
 
 def in_order(log: Log, joints: Sequence[str]) -> Log:
@@ -117,29 +119,28 @@ def in_order(log: Log, joints: Sequence[str]) -> Log:
 
 def join_logs(logs: Mapping[Path, Log]) -> Log:
     """One log of several files, in the order of the first; ValueError: other joints, or empty."""
-    first = next(iter(logs.values()))
-    recordings: list[Recording] = []
-    warnings: list[str] = []
+    first, *_ = logs.values()
+    recordings: tuple[Recording, ...] = ()
+    warnings: tuple[str, ...] = ()
     for path, log in logs.items():
         with expected(path, "a log"):
             recordings += in_order(log, first.joints).recordings
         warnings += log.warnings
     require(len(recordings) > 0, ", ".join(map(str, logs)), "at least one recording", "none")
-    return first._replace(recordings=tuple(recordings), warnings=tuple(warnings))
+    return Log(first.joints, recordings, first.rate, warnings)
 
 
 def write_log(path: Path, log: Log) -> None:
     """Write recordings as one table, `.csv` or `.npz` by the name; read it with `read_log`."""
-    names = [recording.name for recording in log.recordings]
-    lengths = [len(recording.u) for recording in log.recordings]
-    time = np.concatenate([np.arange(length) / log.rate for length in lengths])
-    columns: dict[str, Any] = {"run": np.repeat(names, lengths), "time": time}
-    for kind in ("u", "q"):
-        values = np.concatenate([getattr(recording, kind) for recording in log.recordings])
+    joined = join_recordings(log)
+    time = np.concatenate([np.arange(length) / log.rate for length in joined.lengths])
+    run = np.repeat([recording.name for recording in log.recordings], joined.lengths)
+    columns: dict[str, Any] = {"run": run, "time": time}
+    for kind, values in (("u", joined.u), ("q", joined.q)):
         columns |= {f"{kind}_{name}": values[:, i] for i, name in enumerate(log.joints)}
     if Path(path).suffix == ".csv":
         numbers = [np.char.mod("%.7g", column) for column in list(columns.values())[1:]]
-        write_csv(path, columns, zip(columns["run"], *numbers, strict=True))
+        write_csv(path, columns, zip(run, *numbers, strict=True))
         return
     with whole_file(path) as file:
         np.savez_compressed(file, **columns)

@@ -27,23 +27,22 @@ def free_run(
     Each run has the recorded commands and begins at one of the samples `starts` (s,), which have a
     history before them.
     """
-    recorded = samples.joined
-    q_error, v_error = np.empty((2, ticks, *recorded.q[starts].shape))
+    q_error, v_error = np.empty((2, ticks, *samples.q[starts].shape))
     parts = max(1, math.ceil(len(starts) / 8192))  # bounds the memory
     for runs in np.array_split(np.arange(len(starts)), parts):
         at = starts[runs]
         rows = at[:, None] + np.arange(1 - net.history, 1)
-        history = np.stack([recorded.q[rows], recorded.q_dot[rows], recorded.u[rows - 1]])
+        history = np.stack([samples.q[rows], samples.q_dot[rows], samples.u[rows - 1]])
         history = history.transpose(1, 3, 0, 2).astype(np.float32)  # (s, n, 3, H)
-        q: Array = recorded.q[at]
+        q: Array = samples.q[at]
         for k in range(ticks):
-            u = recorded.u[at + k]
+            u = samples.u[at + k]
             velocity = net.predict(append_command(history, u))
             low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)  # of the training
             q = np.clip(q + velocity / net.rate, low, high)
             history = append_sample(history, u, q, net.velocity_samples, 1 / net.rate)
-            q_error[k, runs] = q - recorded.q[at + k + 1]
-            v_error[k, runs] = history[..., 1, -1] - recorded.q_dot[at + k + 1]
+            q_error[k, runs] = q - samples.q[at + k + 1]
+            v_error[k, runs] = history[..., 1, -1] - samples.q_dot[at + k + 1]
     return q_error, v_error
 
 
@@ -69,7 +68,7 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
         for j, name in enumerate(log.joints):
             scored = samples.moves[starts, j]
             if scored.any():
-                speed = _rms(samples.joined.q_dot[after][:, scored, j])
+                speed = _rms(samples.q_dot[after][:, scored, j])
                 result[name]["free_run"][str(horizon)] = {
                     "velocity_rmse": _rms(v_error[:, scored, j]),
                     "relative_error": _rms(v_error[:, scored, j]) / speed if speed else None,
@@ -83,7 +82,7 @@ def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
     wanted = f"a recording above {net.history + 1} samples"
     require(len(starts) > 0, "log", wanted, samples.lengths[:9])
     error = free_run(net, samples, starts, 1)[0][0] * net.rate
-    persistence = samples.joined.q_dot[starts] - samples.target[starts]
+    persistence = samples.q_dot[starts] - samples.target[starts]
     result: dict[str, Any] = {}
     for j, name in enumerate(net.joints):
         result[name] = {"free_run": {}}

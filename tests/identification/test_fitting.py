@@ -10,7 +10,7 @@ from helpers_machines import line
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.valve_nets import ValveNet, mu_law, open_indicator
 from brokk_min.identification import fitting
-from brokk_min.identification.fitting import PAPER_RECIPE, FitConfig, fit, training_set
+from brokk_min.identification.fitting import PAPER_RECIPE, FitConfig, TrainingSet, fit
 from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
 from brokk_min.identification.validation import free_run, score
 from brokk_min.machine import BROKK_170
@@ -127,14 +127,14 @@ def test_accumulated_loss__is_the_error_of_a_free_run(valve):
     net = fit(log, config, 0, BROKK_170, "brokk170")
     net.weights[5][:] = 1.0  # upwards, by what the nets read
     zones = np.full((2, 2), 0.07, np.float32)
-    data, samples = training_set(log, config, BROKK_170, zones), join_recordings(log)
+    data, samples = TrainingSet(log, config, BROKK_170, zones), join_recordings(log)
     span = (data.output_high - data.output_low).numpy()
-    tops = samples.joined.q.argmax(axis=0)
+    tops = samples.q.argmax(axis=0)
     at = np.array([[20, 40], [350, 700], tops])  # of each window and joint
     expected, at_stop = np.zeros(3), 0  # of each tick: the square of the error that added up
     for j, starts in enumerate(at.T):
         q_error = free_run(net, samples, starts, 3)[0][..., j]
-        q = samples.joined.q[starts + np.arange(1, 4)[:, None], j] + q_error
+        q = samples.q[starts + np.arange(1, 4)[:, None], j] + q_error
         at_stop += np.sum(np.abs(q - net.q_high[j]) < 1e-6)
         expected += np.mean((q_error * 20 / span[j]) ** 2, axis=1)
     assert at_stop >= 2
