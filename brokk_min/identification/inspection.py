@@ -10,7 +10,6 @@ recorded range do not count, because a joint that is pushed against its stop sta
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -39,22 +38,20 @@ BEYOND = 0.05  # of a joint's range, outside of it
 FOLLOWS = 0.8  # of a joint's motion without commands, that another joint explains
 
 
-@dataclass(frozen=True)
-class JointReport:
+class JointReport(NamedTuple):
     """One joint of a log; pairs are up and down."""
 
-    minutes: float  # in recordings in which it has commands
+    minutes: float  # in recordings in which it is driven
     low: float  # rad, smallest angle
     high: float  # rad
-    explained: float  # part of the velocities' power that the model explains
+    fastest: tuple[float, float]  # rad/s, of the velocities in the log
+    opposite: list[str]  # recordings in which it falls under positive commands
+    follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
     sign: int  # of the velocity under a positive command; 0: not clear
+    explained: float  # part of the velocities' power that the model explains
     delay: float  # s
-    tau: float  # s
     dead_zone: tuple[float, float]  # of full command
     gain: tuple[float, float]  # rad/s per command beyond the dead zone; 0: it never moved so
-    fastest: tuple[float, float]  # rad/s, of the velocities in the log
-    opposite: tuple[str, ...]  # recordings in which it falls under positive commands
-    follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
 
 
 def inspect(log: Log) -> dict[str, JointReport]:
@@ -63,18 +60,19 @@ def inspect(log: Log) -> dict[str, JointReport]:
     for j, name in enumerate(tqdm(log.joints, desc="inspect", unit="joint", disable=None)):
         recordings = [one for one in log.recordings if driven(one)[j]]
         if recordings:
-            ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
+            motion = motion_of(recordings, j, log.rate)
             q = np.concatenate([one.q[:, j] for one in recordings])
             q_dot = np.concatenate([one.q_dot[:, j] for one in recordings])
             signs = [sign(motion_of([one], j, log.rate)) for one in recordings]
             reports[name] = JointReport(
-                minutes=ticks / log.rate / 60,
-                low=float(q.min()),
-                high=float(q.max()),
-                fastest=(float(np.quantile(q_dot, FASTEST)), float(np.quantile(-q_dot, FASTEST))),
-                opposite=tuple(recordings[i].name for i, one in enumerate(signs) if one < 0),
+                minutes=len(q) / log.rate / 60,
+                low=q.min(),
+                high=q.max(),
+                fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
+                opposite=[one.name for one, s in zip(recordings, signs, strict=True) if s < 0],
                 follows=followed_joints(log, j),
-                **fit_model(motion_of(recordings, j, log.rate)),
+                sign=sign(motion),
+                **fit_model(motion),
             )
     return reports
 
@@ -136,14 +134,8 @@ def fit_model(motion: Motion) -> dict[str, Any]:
             zones = min(trials, key=lambda trial: fit_gains(motion, lag, trial)[0])
     error, gains = fit_gains(motion, lag, zones)
     power = float(np.square(motion.velocity[motion.counts]).sum())
-    return {
-        "explained": 1 - error / power if power else 0.0,
-        "sign": sign(motion),
-        "delay": lag[0] / motion.rate,
-        "tau": lag[1],
-        "dead_zone": tuple(zones.round(3).tolist()),
-        "gain": tuple(gains.tolist()),
-    }
+    explained, delay = 1 - error / power if power else 0.0, lag[0] / motion.rate
+    return {"explained": explained, "delay": delay, "dead_zone": (*zones,), "gain": (*gains,)}
 
 
 def fit_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> tuple[float, Array]:
@@ -159,25 +151,23 @@ def fit_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> tuple[flo
     return float(error @ error), gains
 
 
-def wrong_signs(reports: Mapping[str, JointReport]) -> list[str]:
+def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
     """Joints whose angle falls under positive commands, in words."""
-    return [
-        f"u_{name}: expected positive commands to raise q_{name}, got falling angles in "
-        f"{brief(list(report.opposite))} (--map {name}=COLUMN:-1)"
-        for name, report in reports.items()
-        if report.opposite
-    ]
+    for name, report in reports.items():
+        if report.opposite:
+            got = f"falling angles in {brief(report.opposite)} (--map {name}=COLUMN:-1)"
+            yield f"u_{name}: expected positive commands to raise q_{name}, got {got}"
 
 
 def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | None) -> list[str]:
     """What a log lacks, and where it contradicts the range of the machine that it should be of."""
     result = [*log.warnings, *wrong_signs(reports)]
+    joints = {joint.name: joint for joint in machine.joints} if machine else {}
     for name in log.joints:
-        if name not in reports:
+        if name in reports:
+            result += joint_warnings(name, reports[name], joints.get(name))
+        else:
             result.append(f"{name}: expected commands in the log, got none")
-            continue
-        joint = machine.joints[machine.names.index(name)] if machine else None
-        result += joint_warnings(name, reports[name], joint)
     return result
 
 
@@ -190,28 +180,24 @@ def joint_warnings(name: str, r: JointReport, joint: Joint | None) -> Iterator[s
         doubt = "is it an angle to the ground? Then take differences of both angles"
         yield f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}"
     elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 1e-9:
-        wanted = f"commands that explain {LEAST_EXPLAINED:.0%} of its motion, soon after them"
         got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
-        yield f"{name}: expected {wanted}, got {got}"
+        yield f"{name}: expected commands that explain {LEAST_EXPLAINED:.0%} of it, got {got}"
     if joint:
-        whole = joint.q_max - joint.q_min
+        got, whole = f"{r.low:.2f} to {r.high:.2f}", joint.q_max - joint.q_min
         if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
-            wanted = f"angles of {joint.q_min:g} to {joint.q_max:g}"
             doubt = f"another unit (--map {name}=COLUMN:deg), zero or joint?"
-            yield f"{name}: expected {wanted}, got {r.low:.2f} to {r.high:.2f}: {doubt}"
+            yield f"{name}: expected {joint.q_min:g} to {joint.q_max:g}, got {got}: {doubt}"
         elif r.high - r.low < LEAST_RANGE * whole:
-            wanted = f"{LEAST_RANGE:.0%} of its range or more"
-            yield f"{name}: expected {wanted}, got {(r.high - r.low) / whole:.0%}"
+            yield f"{name}: expected {LEAST_RANGE:.0%} of its range or more, got {got}"
 
 
-def table(reports: Mapping[str, JointReport]) -> list[str]:
-    """Lines of what a log tells, and fields of `Joint` by it, to copy into a machine."""
-    lines, fields = ["joint        minutes sign explained delay [s]  gain up  down"], []
+def table(reports: Mapping[str, JointReport]) -> Iterator[str]:
+    """What a log tells of each joint, and fields of `Joint` by it, to copy into a machine."""
+    fields = "q_min={:.3f}, q_max={:.3f}, q_dot_up={:.3f}, q_dot_down={:.3f}"
     for name, r in reports.items():
-        numbers = f"{r.minutes:7.1f} {r.sign:+4d} {r.explained:9.0%} {r.delay:9.2f}"
-        lines.append(f"{name:12} {numbers}  {r.gain[0]:<8.3f} {r.gain[1]:.3f}")
-        limits = f"q_min={r.low:.3f}, q_max={r.high:.3f}"
-        speeds = "q_dot_up={:.3f}, q_dot_down={:.3f}".format(*r.fastest)
+        told = f"{r.minutes:.1f} minutes, sign {r.sign:+d}, {r.explained:.0%} explained"
+        gains = "gains {:.3f} up, {:.3f} down".format(*r.gain)
+        yield f"{name}: {told}, delay {r.delay:.2f} s, {gains}"
+        values = fields.format(r.low, r.high, *r.fastest)
         zones = "dead_zone=({:.3f}, {:.3f})".format(*r.dead_zone)
-        fields.append(f'Joint("{name}", {limits}, {speeds}, {zones}, ...)')
-    return lines + fields
+        yield f'Joint("{name}", {values}, {zones}, ...)'

@@ -1,7 +1,5 @@
 """What a log tells: known joints are found again, and a log that cannot be of a machine is told."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -50,7 +48,7 @@ def log_of(*recordings):
 @pytest.mark.parametrize("name", TRUE)
 def test_inspect__finds_what_is_true(name):
     """Also of a joint that is pushed against its stops, where samples do not count."""
-    up, down, gain_up, gain_down, delay, tau = TRUE[name]
+    up, down, gain_up, gain_down, delay, _ = TRUE[name]
     free = [record(name, holds(seed)) for seed in range(4)]
     pushed = [record(name, holds(hold=40, ticks=8000, largest=0.8), stop=0.3)]
     assert (np.abs(pushed[0].q).max(axis=1) > 0.299).mean() > 0.4
@@ -61,7 +59,6 @@ def test_inspect__finds_what_is_true(name):
         assert report.sign == np.sign(gain_up)
     assert report.explained > 0.9
     assert report.delay == pytest.approx(0.05 * delay, abs=0.051)
-    assert report.tau == pytest.approx(tau, abs=0.1)
     assert report.minutes == pytest.approx(4 * 4000 / 20 / 60)
     angles = np.concatenate([respond(name, holds(seed)) for seed in range(4)])
     assert (report.low, report.high) == pytest.approx((angles.min(), angles.max()))
@@ -95,7 +92,7 @@ def test_inspect__names_recordings_in_which_angles_fall_under_positive_commands(
         recordings.append(Recording(f"{seed}", one.u, sign * one.q, sign * one.q_dot))
     sines = [0.5 * np.sin(2 * np.pi * 2.5 * np.arange(ticks) / 20) for ticks in (100, 600)]
     reports = inspect(log_of(*recordings, *(record("boom", sine) for sine in sines)))
-    assert reports["boom"].opposite == ("1", "4")
+    assert reports["boom"].opposite == ["1", "4"]
     (told,) = wrong_signs(reports)
     assert told.startswith("u_boom: expected positive commands to raise q_boom")
 
@@ -114,7 +111,7 @@ def test_inspect__sees_an_angle_to_the_ground(slope):
     assert len(told) == len(expected)
 
 
-GOOD = JointReport(20.0, -2.1, 2.1, 0.9, 1, 0.1, 0.1, (0.07, 0.07), (0.3, 0.3), (0.2, 0.2), (), {})
+GOOD = JointReport(20.0, -2.1, 2.1, (0.2, 0.2), [], {}, 1, 0.9, 0.1, (0.07, 0.07), (0.3, 0.3))
 
 
 @pytest.mark.parametrize(
@@ -122,14 +119,14 @@ GOOD = JointReport(20.0, -2.1, 2.1, 0.9, 1, 0.1, 0.1, (0.07, 0.07), (0.3, 0.3), 
     [
         ({}, []),
         ({"minutes": 9.0}, ["q1: expected 10 minutes, got 9.0"]),
-        ({"low": -0.5}, ["q1: expected 70% of its range or more, got 61%"]),
-        ({"high": 120.0}, ["q1: expected angles of -2.14 to 2.14, got -2.10 to 120.00: another"]),
+        ({"low": -0.5}, ["q1: expected 70% of its range or more, got -0.50 to 2.10"]),
+        ({"high": 120.0}, ["q1: expected -2.14 to 2.14, got -2.10 to 120.00: another"]),
         ({"explained": 0.05}, ["q1: expected commands that explain"]),
-        ({"opposite": ("x",)}, ["u_q1: expected positive commands to raise q_q1"]),
+        ({"opposite": ["x"]}, ["u_q1: expected positive commands to raise q_q1"]),
     ],
 )
 def test_warnings__know_what_a_log_lacks_and_where_it_contradicts_its_machine(changes, expected):
     log = Log(("q1",), (), warnings=("left out",))
-    first, *found = warnings(log, {"q1": replace(GOOD, **changes)}, BROKK_170)
+    first, *found = warnings(log, {"q1": GOOD._replace(**changes)}, BROKK_170)
     assert first == "left out" and len(found) == len(expected)
     assert all(text.startswith(start) for text, start in zip(found, expected, strict=True))
