@@ -118,7 +118,7 @@ class Fit(ReadsLogs):
         name = known.name if known else ""
         net = fitting.fit(log, settings, self.seed, machine, name)
         scores = validation.score(net, test)
-        warnings = validation.warnings(scores) + inspection.warnings(log, reports, known)
+        warnings = [*validation.warnings(scores), *inspection.warnings(log, reports, known)]
         save_net(self.out, net)
         if self.json:
             meta: dict[str, Any] = {"machine": name, "rate": net.rate, "history": net.history}

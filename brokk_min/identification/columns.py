@@ -60,10 +60,9 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
     require(len(joints) > 0, "columns", "u_<joint> (--map u_NAME=COLUMN:UNIT)", brief(list(table)))
     names = ["time", *(f"{kind}_{joint}" for kind in "uq" for joint in joints)]
     sources = {name: (name, 1.0) for name in names} | mapped
-    missing = {name: column for name, (column, _) in sources.items() if column not in table}
-    if missing:
-        wanted = f"{brief([*missing.values()])} (--map {next(iter(missing))}=COLUMN:UNIT)"
-        raise ValueError(f"columns: expected {wanted}, got {brief(list(table))}")
+    for name, (column, _) in sources.items():
+        wanted = f"{column!r} (--map {name}=COLUMN:UNIT)"
+        require(column in table, "columns", wanted, brief(list(table)))
     result = {}
     for name in names:
         column, factor = sources[name]

@@ -7,14 +7,14 @@ are validated on `task_log`, where the joints move together, as under a policy.
 from itertools import chain
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.identification.logs import Log, machine_log
+from brokk_min.identification.readings import Rows
 from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder
 
-Indices = NDArray[np.intp]
 # Probabilities of the parts of rich excitation, assumed.
 MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "start": 0.21, "barely open": 0.35}
 BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: the largest of these levels
@@ -125,13 +125,12 @@ def collect(
 
 
 def _drive_segments(
-    machine: Machine, plant: Plant, joint: Indices, excitation: str, rng: np.random.Generator
-) -> tuple[Array, Array, Indices]:
+    machine: Machine, plant: Plant, joint: Rows, excitation: str, rng: np.random.Generator
+) -> tuple[Array, Array, Rows]:
     """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves, and its last ticks.
 
-    Segments start at mid range; if rich, at random angles of the joint, a tenth at either limit.
-    They end after their commands, or within two counts of a limit, but not within a second. Rich
-    excitation pushes for a second first.
+    A segment ends after its commands, or within two counts of a limit, but not within a second.
+    Rich excitation pushes for a second first, and starts a tenth of its segments at either limit.
     """
     rows, rich = np.arange(len(joint)), excitation == "rich"
     low, high = machine.column("q_min"), machine.column("q_max")

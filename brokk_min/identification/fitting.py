@@ -18,7 +18,7 @@ import torch
 from torch import Generator, Tensor
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet
+from brokk_min.actuator import ActuatorNet, estimate_velocity
 from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
@@ -91,8 +91,8 @@ class TrainingSet:
         self.reads = torch.ones(mean.shape[1])  # 1 for inputs that the nets read, (I,)
         if config.newest_only:
             self.reads.view(-1, H)[:2, :-1] = 0
-        t = (np.arange(window) - (window - 1) / 2) / log.rate
-        self.estimator = tensor(t / (t @ t))  # weights of the velocity estimator
+        weights = estimate_velocity(np.eye(window), window, 1 / log.rate)
+        self.estimator = tensor(weights)  # of the newest angles
 
 
 def input_moments(signals: Array, windows: list[Rows], zones: Array | None) -> list[Array]:

@@ -51,7 +51,6 @@ class JointReport(NamedTuple):
     explained: float  # part of the velocities' power that the model explains
     delay: float  # s
     dead_zone: tuple[float, float]  # of full command
-    gain: tuple[float, float]  # rad/s per command beyond the dead zone; 0: it never moved so
 
 
 def inspect(log: Log) -> dict[str, JointReport]:
@@ -128,18 +127,16 @@ def fit_model(motion: Motion) -> dict[str, Any]:
     lags = list(product(range(round(LATEST * motion.rate) + 1), TAUS))
     zones = np.array([0.05, 0.05])
     for _ in range(2):
-        lag = min(lags, key=lambda lag: fit_gains(motion, lag, zones)[0])
+        lag = min(lags, key=lambda lag: unexplained(motion, lag, zones))
         for side in (0, 1):
             trials = [np.where(np.arange(2) == side, zone, zones) for zone in ZONES]
-            zones = min(trials, key=lambda trial: fit_gains(motion, lag, trial)[0])
-    error, gains = fit_gains(motion, lag, zones)
-    power = float(np.square(motion.velocity[motion.counts]).sum())
-    explained, delay = 1 - error / power if power else 0.0, lag[0] / motion.rate
-    return {"explained": explained, "delay": delay, "dead_zone": (*zones,), "gain": (*gains,)}
+            zones = min(trials, key=lambda trial: unexplained(motion, lag, trial))
+    explained, delay = 1 - unexplained(motion, lag, zones), lag[0] / motion.rate
+    return {"explained": explained, "delay": delay, "dead_zone": tuple(zones)}
 
 
-def fit_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> tuple[float, Array]:
-    """Sum of the squared errors of the model with the best gains (2,), and these gains."""
+def unexplained(motion: Motion, lag: tuple[int, float], zones: Array) -> float:
+    """The part of the velocities' power that is not in the model with the best gains."""
     (delay, tau), (up, down) = lag, zones
     late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
     openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
@@ -148,7 +145,7 @@ def fit_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> tuple[flo
     velocity = motion.velocity[motion.counts]
     gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
     error = velocity - gains @ x
-    return float(error @ error), gains
+    return float(error @ error) / max(float(velocity @ velocity), 1e-12)
 
 
 def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
@@ -196,8 +193,7 @@ def table(reports: Mapping[str, JointReport]) -> Iterator[str]:
     fields = "q_min={:.3f}, q_max={:.3f}, q_dot_up={:.3f}, q_dot_down={:.3f}"
     for name, r in reports.items():
         told = f"{r.minutes:.1f} minutes, sign {r.sign:+d}, {r.explained:.0%} explained"
-        gains = "gains {:.3f} up, {:.3f} down".format(*r.gain)
-        yield f"{name}: {told}, delay {r.delay:.2f} s, {gains}"
+        yield f"{name}: {told}, delay {r.delay:.2f} s"
         values = fields.format(r.low, r.high, *r.fastest)
         zones = "dead_zone=({:.3f}, {:.3f})".format(*r.dead_zone)
         yield f'Joint("{name}", {values}, {zones}, ...)'

@@ -104,6 +104,5 @@ def left_out(wrong: NDArray[np.bool_], q: Array, joints: Sequence[str]) -> Itera
     for name, bad, angle in zip(joints, wrong.T, q.T, strict=True):
         if bad.any():
             row = bad.argmax()
-            what = f"which is left out or begins a new recording (such rows: {bad.sum()})"
-            got = f"a jump to {angle[row]:.4g}, {what}"
+            got = f"a jump to {angle[row]:.4g}: left out, or a new recording (rows: {bad.sum()})"
             yield f"row {row + 2}: expected motion of q_{name}, got {got}"

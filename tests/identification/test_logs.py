@@ -149,8 +149,8 @@ def test_read_log__leaves_out_readings_that_no_motion_explains(tmp_path, wrong, 
     np.testing.assert_allclose(log.recordings[0].u, sound.recordings[0].u[1:-1], atol=1e-12)
     assert (speed_of(log) < speed_of(sound) + 0.05).all()
     assert len(log.warnings) == 2
-    told = f"log.npz: row 2: expected motion of q_a, got a jump to {wrong:.4g}, which is left out"
-    assert told in log.warnings[0] and log.warnings[0].endswith("(such rows: 4)")
+    told = f"log.npz: row 2: expected motion of q_a, got a jump to {wrong:.4g}: left out, "
+    assert told in log.warnings[0] and log.warnings[0].endswith("(rows: 4)")
     assert "log.npz: row 62: expected motion of q_b" in log.warnings[1]
 
 
@@ -210,8 +210,8 @@ SECOND_EARLIER = "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0
     ("text", "message"),
     [
         (GOOD.replace(",", ";"), "columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got "),
-        ("run,u_a,q_a\nx,0,0\n", "columns: expected ['time'] (--map time=COLUMN:UNIT), got ['run'"),
-        ("run,time,u_a\nx,0,0\n", "columns: expected ['q_a'] (--map q_a=COLUMN:UNIT), got ['run'"),
+        ("run,u_a,q_a\nx,0,0\n", "columns: expected 'time' (--map time=COLUMN:UNIT), got ['run'"),
+        ("run,time,u_a\nx,0,0\n", "columns: expected 'q_a' (--map q_a=COLUMN:UNIT), got ['run'"),
         (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1 (per cent: --map u_a="),
         (GOOD.replace("0.10", "0.05"), "run x, column time: expected stamps that rise, got a step"),
         (SECOND_EARLIER, "run x, column time: expected stamps that rise, got a step of -0.03 at 1"),
