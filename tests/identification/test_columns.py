@@ -9,9 +9,11 @@ from brokk_min.machine import BROKK_170
 
 
 def theirs(tmp_path, *stamps):
+    """With a byte order mark, spaces in the header, and the line ends of Windows."""
     path = tmp_path / "theirs.csv"
-    rows = [f"{stamps[k]},A,{10 + k}.0,{(25, -50, 100)[k]},start" for k in range(3)]
-    path.write_text("\n".join(["Zeit,Drive,Boom [deg],Lever,Note", *rows]) + "\n")
+    rows = [f"{stamps[k]},7,{10 + k}.0,{(25, -50, 100)[k]},start" for k in range(3)]
+    text = "\r\n".join(["\ufeffZeit, Drive, Boom [deg],Lever,Note", *rows, ""])
+    path.write_bytes(text.encode())
     return path
 
 
@@ -26,7 +28,7 @@ def theirs(tmp_path, *stamps):
 def test_load_table__takes_names_units_and_stamps_from_a_mapping(tmp_path, stamps, unit):
     mapped = parse_map(f"boom=Boom [deg]:deg, u_boom=Lever:percent,run=Drive,time=Zeit{unit}")
     table = load_table(theirs(tmp_path, *stamps), mapped)
-    assert table["run"].tolist() == ["A", "A", "A"]
+    assert table["run"].tolist() == ["7"] * 3
     np.testing.assert_allclose(table["time"] - table["time"][0], [0, 0.05, 0.1], atol=1e-9)
     np.testing.assert_allclose(table["q_boom"], np.deg2rad([10, 11, 12]))
     np.testing.assert_allclose(table["u_boom"], [0.25, -0.5, 1.0])
