@@ -82,7 +82,7 @@ class Inspect(ReadsLogs):
 
         log, known = self.read_logs(self.logs, machine)
         reports = inspection.inspect(log)
-        warnings, scores = inspection.warnings(log, reports, known), {}
+        warnings, scores = [*inspection.warnings(log, reports, known)], {}
         if self.net:
             net = load_net(self.net)
             scores = validation.score(net, logs.in_order(log, net.joints))

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from brokk_min._files import brief
 from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
-from brokk_min.machine import Array, Joint, Machine
+from brokk_min.machine import Array, Machine
 
 # What is searched, all assumed.
 LATEST = 0.4  # s, longest delay
@@ -156,44 +156,38 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
             yield f"u_{name}: expected positive commands to raise q_{name}, got {got}"
 
 
-def warnings(log: Log, reports: Mapping[str, JointReport], machine: Machine | None) -> list[str]:
+def warnings(
+    log: Log, reports: Mapping[str, JointReport], machine: Machine | None
+) -> Iterator[str]:
     """What a log lacks, and where it contradicts the range of the machine that it should be of."""
-    result = [*log.warnings, *wrong_signs(reports)]
+    yield from log.warnings
+    yield from wrong_signs(reports)
     joints = {joint.name: joint for joint in machine.joints} if machine else {}
-    for name in log.joints:
-        if name in reports:
-            result += joint_warnings(name, reports[name], joints.get(name))
-        else:
-            result.append(f"{name}: expected commands in the log, got none")
-    return result
-
-
-def joint_warnings(name: str, r: JointReport, joint: Joint | None) -> Iterator[str]:
-    """Does a joint move for long enough, by its commands alone, and over its range, not beyond?"""
-    if r.minutes < LEAST_MINUTES:
-        yield f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}"
-    if r.follows:
-        slopes = ", ".join(f"{slope:+.2f} times with {one}" for one, slope in r.follows.items())
-        doubt = "is it an angle to the ground? Then take differences of both angles"
-        yield f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}"
-    elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 1e-9:
-        got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
-        yield f"{name}: expected commands that explain {LEAST_EXPLAINED:.0%} of it, got {got}"
-    if joint:
-        got, whole = f"{r.low:.2f} to {r.high:.2f}", joint.q_max - joint.q_min
-        if max(joint.q_min - r.low, r.high - joint.q_max) > BEYOND * whole:
-            doubt = f"another unit (--map {name}=COLUMN:deg), zero or joint?"
-            yield f"{name}: expected {joint.q_min:g} to {joint.q_max:g}, got {got}: {doubt}"
-        elif r.high - r.low < LEAST_RANGE * whole:
-            yield f"{name}: expected {LEAST_RANGE:.0%} of its range or more, got {got}"
+    for name, r in reports.items():
+        if r.minutes < LEAST_MINUTES:
+            yield f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}"
+        if r.follows:
+            slopes = ", ".join(f"{slope:+.2f} times with {one}" for one, slope in r.follows.items())
+            doubt = "is it an angle to the ground? Then take differences of both angles"
+            yield f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}"
+        elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 1e-9:
+            got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
+            yield f"{name}: expected commands that explain {LEAST_EXPLAINED:.0%} of it, got {got}"
+        if joint := joints.get(name):
+            low, high, got = joint.q_min, joint.q_max, f"{r.low:.2f} to {r.high:.2f}"
+            if max(low - r.low, r.high - high) > BEYOND * (high - low):
+                doubt = f"another unit (--map {name}=COLUMN:deg), zero or joint?"
+                yield f"{name}: expected {low:g} to {high:g}, got {got}: {doubt}"
+            elif r.high - r.low < LEAST_RANGE * (high - low):
+                yield f"{name}: expected {LEAST_RANGE:.0%} of its range or more, got {got}"
 
 
 def table(reports: Mapping[str, JointReport]) -> Iterator[str]:
     """What a log tells of each joint, and fields of `Joint` by it, to copy into a machine."""
-    fields = "q_min={:.3f}, q_max={:.3f}, q_dot_up={:.3f}, q_dot_down={:.3f}"
     for name, r in reports.items():
         told = f"{r.minutes:.1f} minutes, sign {r.sign:+d}, {r.explained:.0%} explained"
         yield f"{name}: {told}, delay {r.delay:.2f} s"
-        values = fields.format(r.low, r.high, *r.fastest)
+        limits = f"q_min={r.low:.3f}, q_max={r.high:.3f}"
+        speeds = "q_dot_up={:.3f}, q_dot_down={:.3f}".format(*r.fastest)
         zones = "dead_zone=({:.3f}, {:.3f})".format(*r.dead_zone)
-        yield f'Joint("{name}", {values}, {zones}, ...)'
+        yield f'Joint("{name}", {limits}, {speeds}, {zones}, ...)'

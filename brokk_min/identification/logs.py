@@ -8,6 +8,7 @@ below the machine's, and it may jitter.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,12 +101,11 @@ def split(log: Log) -> tuple[Log, Log]:
     ValueError: no two recordings drive the same joints.
     """
     keys = [driven(recording).tobytes() for recording in log.recordings]
-    tested, fitted = [], []
-    for i, (key, recording) in enumerate(zip(keys, log.recordings, strict=True)):
-        held_out = keys.count(key) > 1 and keys[:i].count(key) % 10 == 0
-        (tested if held_out else fitted).append(recording)
+    scored = [keys.count(key) > 1 and keys[:i].count(key) % 10 == 0 for i, key in enumerate(keys)]
     wanted = "two or more (column run) that drive the same joints, or --test"
-    require(len(tested) > 0, "recordings", wanted, len(fitted))
+    require(any(scored), "recordings", wanted, len(log.recordings))
+    fitted = compress(log.recordings, np.logical_not(scored))
+    tested = compress(log.recordings, scored)
     return log._replace(recordings=tuple(fitted)), log._replace(recordings=tuple(tested))
 
 

@@ -54,10 +54,9 @@ def fingerprint(net: ActuatorNet) -> str:
 
 def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
     """The nets of the machine's driven joints; ValueError: of another machine, or not of all."""
-    wanted: dict[str, Any] = {"machine": machine.name}
-    wanted |= {name: getattr(machine, name) for name in ("rate", "history", "velocity_samples")}
-    found = {name: getattr(net, name) for name in wanted}
-    require(found == wanted, "actuator", f"nets for {machine.name} with {wanted}", found)
+    wanted = (machine.name, machine.rate, machine.history, machine.velocity_samples)
+    found = (net.machine, net.rate, net.history, net.velocity_samples)
+    require(found == wanted, "actuator", f"nets with name, rate, samples {wanted}", found)
     joints = tuple(machine.names[i] for i in machine.driven)
     known = set(joints) <= set(net.joints)
     require(known, "joints", f"nets for {list(joints)}", list(net.joints))
