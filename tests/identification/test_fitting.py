@@ -20,17 +20,16 @@ def simple_system(seed, recordings, ticks=300):
     """Two first-order joints, q_ddot = (gain u - q_dot) / tau, turned back at +-0.8 rad."""
     rng = np.random.default_rng(seed)
     gain, tau, shape = np.array([0.5, 1.0]), np.array([0.15, 0.3]), (recordings, 2)
-    q, q_dot, u = rng.uniform(-0.5, 0.5, shape), np.zeros(shape), np.zeros(shape)
-    rows = []
+    q, q_dot = rng.uniform(-0.5, 0.5, shape), np.zeros(shape)
+    u_log, q_log = np.zeros((2, ticks, *shape))
     for tick in range(ticks):
         if tick % 8 == 0:
             u = np.where(np.abs(q) > 0.8, -np.sign(q) * 0.6, rng.uniform(-1, 1, shape))
-        rows.append((u, q))
+        u_log[tick], q_log[tick] = u, q
         for _ in range(10):
             q, q_dot = q + 0.005 * q_dot, q_dot + 0.005 * (gain * u - q_dot) / tau
-    result = []
-    for i, (u, q) in enumerate(np.array(rows).transpose(2, 1, 0, 3)):
-        result.append(Recording(f"r{i}", u, q, velocity_of(q, 4)))
+    parts = zip(u_log.swapaxes(0, 1), q_log.swapaxes(0, 1), strict=True)
+    result = [Recording(f"r{i}", u, q, velocity_of(q, 4)) for i, (u, q) in enumerate(parts)]
     return Log(("boom", "stick"), tuple(result))
 
 
@@ -145,13 +144,12 @@ def test_accumulated_loss__is_the_error_of_a_free_run(valve):
 
 
 def test_fit__has_a_learning_rate_that_falls_to_zero_in_each_stage(monkeypatch):
-    rates = []
+    rates, step = [], torch.optim.AdamW.step
 
-    class Adam(torch.optim.AdamW):
-        def step(self):
-            rates.append(self.param_groups[0]["lr"])
-            super().step()
+    def noted(optimizer):
+        rates.append(optimizer.param_groups[0]["lr"])
+        step(optimizer)
 
-    monkeypatch.setattr(torch.optim, "AdamW", Adam)
+    monkeypatch.setattr(torch.optim.AdamW, "step", noted)
     fit(simple_system(0, 2, 60), FitConfig(12, 8, learning_rate=1.0), 0, BROKK_170)
     assert [rates[step] for step in (0, 4, 8, 10)] == pytest.approx([1.0, 0.5, 0.25, 0.125])

@@ -16,9 +16,8 @@ from brokk_min.machine import BROKK_170
 
 def read_columns(folder, columns, machine=BROKK_170):
     """A table `.npz` written without the package."""
-    path = folder / "log.npz"
-    np.savez(path, **columns)
-    return read_log(path, machine)
+    np.savez(folder / "log.npz", **columns)
+    return read_log(folder / "log.npz", machine)
 
 
 @pytest.mark.parametrize(("suffix", "rate", "atol"), [(".csv", 25.0, 2e-6), (".npz", 20.0, 1e-12)])
@@ -111,10 +110,10 @@ def swinging(rate=20.0, seconds=20.0):
 
 def of_speeds(a, b):
     """A machine with joints "a" and "b" of these nominal speeds [rad/s]."""
-    one, two, *others = BROKK_170.joints
+    one, two, *_ = BROKK_170.joints
     one = replace(one, name="a", q_dot_up=a, q_dot_down=a)
     two = replace(two, name="b", q_dot_up=b, q_dot_down=b)
-    return replace(BROKK_170, joints=(one, two, *others))
+    return replace(BROKK_170, joints=(one, two), q_start=())
 
 
 def speed_of(log):
@@ -200,7 +199,6 @@ SECOND_EARLIER = "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0
     [
         (GOOD.replace(",", ";"), "columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got "),
         ("run,u_a,q_a\nx,0,0\n", "columns: expected 'time' (--map time=COLUMN:UNIT), got ['run'"),
-        ("run,time,u_a\nx,0,0\n", "columns: expected 'q_a' (--map q_a=COLUMN:UNIT), got ['run'"),
         (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1 (per cent: --map u_a="),
         (GOOD.replace("0.10", "0.05"), "run x, column time: expected stamps that rise, got a step"),
         (SECOND_EARLIER, "run x, column time: expected stamps that rise, got a step of -0.03 at 1"),
