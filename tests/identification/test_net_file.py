@@ -72,14 +72,13 @@ def test_select_nets__predict_as_they_do_among_others(net):
 def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator(tmp_path):
     net = small_net(BROKK_170, np.random.default_rng(0), BROKK_170.names)
     assert select_nets(BROKK_170, net).joints == ("q1", "q3", "q4", "q5")
+    refusal = "actuator: expected nets with .*'brokk170'"
     changes = {"machine": "other", "rate": 25.0, "history": 12, "velocity_samples": 3}
     for name, value in changes.items():
-        with pytest.raises(
-            ValueError, match=f"actuator: expected nets with .*'brokk170'.*{value!r}"
-        ):
+        with pytest.raises(ValueError, match=f"{refusal}.*{value!r}"):
             select_nets(BROKK_170, replace(net, **{name: value}))
     with pytest.raises(ValueError, match=r"joints: expected nets for \['j0', 'j9'\]"):
         select_nets(machine_with(["j0", "j9"]), random_net())
     save_net(tmp_path / "net.npz", replace(net, machine="other"))
-    with pytest.raises(ValueError, match=r"net\.npz: actuator: expected nets with .*'brokk170'"):
+    with pytest.raises(ValueError, match=rf"net\.npz: {refusal}"):
         load_net(tmp_path / "net.npz", BROKK_170)
