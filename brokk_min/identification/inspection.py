@@ -19,7 +19,8 @@ from scipy.signal import lfilter
 from tqdm import tqdm
 
 from brokk_min._files import brief
-from brokk_min.identification.logs import COMMANDED, Log, Recording, driven
+from brokk_min.identification import logs
+from brokk_min.identification.logs import Log, Recording, Samples
 from brokk_min.machine import Array, Machine
 
 # What is searched, all assumed.
@@ -55,13 +56,12 @@ class JointReport(NamedTuple):
 
 def inspect(log: Log) -> dict[str, JointReport]:
     """A report of each joint that is driven in a log."""
-    reports = {}
+    reports, samples = {}, logs.join_recordings(log)
     for j, name in enumerate(tqdm(log.joints, desc="inspect", unit="joint", disable=None)):
-        recordings = [one for one in log.recordings if driven(one)[j]]
+        recordings = [one for one in log.recordings if logs.driven(one)[j]]
         if recordings:
-            motion = motion_of(recordings, j, log.rate)
-            q = np.concatenate([one.q[:, j] for one in recordings])
-            q_dot = np.concatenate([one.q_dot[:, j] for one in recordings])
+            motion, rows = motion_of(recordings, j, log.rate), samples.moves[:, j]
+            q, q_dot = samples.q[rows, j], samples.q_dot[rows, j]
             signs = [sign(motion_of([one], j, log.rate)) for one in recordings]
             reports[name] = JointReport(
                 minutes=len(q) / log.rate / 60,
@@ -69,7 +69,7 @@ def inspect(log: Log) -> dict[str, JointReport]:
                 high=q.max(),
                 fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
                 opposite=[one.name for one, s in zip(recordings, signs, strict=True) if s < 0],
-                follows=followed_joints(log, j),
+                follows=followed_joints(log, samples, j),
                 sign=sign(motion),
                 **fit_model(motion),
             )
@@ -107,13 +107,11 @@ def sign(motion: Motion) -> int:
     return int(np.sign(u @ velocity)) if abs(u @ velocity) > CLEAR_SIGN * size else 0
 
 
-def followed_joints(log: Log, j: int) -> dict[str, float]:
+def followed_joints(log: Log, samples: Samples, j: int) -> dict[str, float]:
     """Joints with which joint `j` moves at their speed while it has no commands, and the slopes."""
-    idle, still = [], round(log.rate)  # a second without commands
-    for one in log.recordings:
-        recent = np.convolve(np.abs(one.u[:, j]) > COMMANDED, np.ones(still))[: len(one.u)]
-        idle.append(np.where(recent[:, None] == 0, one.q_dot, 0.0))
-    q_dot = np.concatenate(idle)
+    second = np.ones(round(log.rate))
+    recent = np.convolve(np.abs(samples.u[:, j]) > logs.COMMANDED, second)[: len(samples.u)]
+    q_dot = np.where(recent[:, None] == 0, samples.q_dot, 0.0)
     power = np.square(q_dot).sum(axis=0)
     slopes = q_dot.T @ q_dot[:, j] / np.maximum(power, 1e-12)
     errors = np.where(q_dot != 0, q_dot[:, [j]] - slopes * q_dot, 0.0)
