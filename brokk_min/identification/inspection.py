@@ -170,12 +170,12 @@ def warnings(
             yield f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}"
         elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 1e-9:
             got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
-            yield f"{name}: expected commands that explain {LEAST_EXPLAINED:.0%} of it, got {got}"
+            yield f"{name}: expected {LEAST_EXPLAINED:.0%} of its motion by its commands, got {got}"
         if joint := joints.get(name):
             low, high, got = joint.q_min, joint.q_max, f"{r.low:.2f} to {r.high:.2f}"
             if max(low - r.low, r.high - high) > BEYOND * (high - low):
                 doubt = f"another unit (--map {name}=COLUMN:deg), zero or joint?"
-                yield f"{name}: expected {low:g} to {high:g}, got {got}: {doubt}"
+                yield f"q_{name}: expected {low:g} to {high:g}, got {got}: {doubt}"
             elif r.high - r.low < LEAST_RANGE * (high - low):
                 yield f"{name}: expected {LEAST_RANGE:.0%} of its range or more, got {got}"
 

@@ -75,8 +75,8 @@ def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str
     rows = np.array([rows_per_value(angle) for angle in q.T])
     period = np.median(step) * rows  # s, of new angles
     slow = [name for name, dt in zip(joints, period, strict=True) if dt > 1.05 / rate]
-    wanted = f"new angles at {rate:g} Hz, the machine's rate (--machine), or more"
-    got = f"one every {rows.max():g} rows: {1 / period.max():.3g} Hz (in ms: --map time=COLUMN:ms)"
+    wanted = f"new angles at the machine's {rate:g} Hz or more (if in ms: --map time=COLUMN:ms)"
+    got = f"one every {rows.max():g} rows: {1 / period.max():.3g} Hz"
     require(not slow, f"run {run}, q of {brief(slow)}", wanted, got)
 
 

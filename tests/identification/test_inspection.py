@@ -117,8 +117,8 @@ GOOD = JointReport(20.0, -2.1, 2.1, (0.2, 0.2), [], {}, 1, 0.9, 0.1, (0.07, 0.07
         ({}, []),
         ({"minutes": 9.0}, ["q1: expected 10 minutes, got 9.0"]),
         ({"low": -0.5}, ["q1: expected 70% of its range or more, got -0.50 to 2.10"]),
-        ({"high": 120.0}, ["q1: expected -2.14 to 2.14, got -2.10 to 120.00: another"]),
-        ({"explained": 0.05}, ["q1: expected commands that explain"]),
+        ({"high": 120.0}, ["q_q1: expected -2.14 to 2.14, got -2.10 to 120.00: another"]),
+        ({"explained": 0.05}, ["q1: expected 60% of its motion by its commands, got 5%"]),
         ({"opposite": ["x"]}, ["u_q1: expected positive commands to raise q_q1"]),
     ],
 )

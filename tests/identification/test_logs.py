@@ -1,6 +1,5 @@
 """Logs: what is written reads back, any rate becomes the machine's, and errors have a place."""
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -165,7 +164,7 @@ def test_read_log__refuses_a_sensor_that_is_slower_than_the_rows(tmp_path, every
     """Only the moving joint's values repeat; a parked joint repeats its value anyway."""
     columns = swinging()
     columns["q_a"] = columns["q_a"][np.arange(400) // every * every]
-    wanted, got = "expected new angles at 20 Hz.*", f"got one every {every} rows"
+    wanted, got = "expected new angles at the machine's 20 Hz.*", f"got one every {every} rows"
     with pytest.raises(ValueError, match=rf"run x, q of \['a'\]: {wanted}, {got}"):
         read_columns(tmp_path, columns)
     fast = swinging(rate=20.0 * every)
@@ -202,10 +201,7 @@ SECOND_EARLIER = "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0
         (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1 (per cent: --map u_a="),
         (GOOD.replace("0.10", "0.05"), "run x, column time: expected stamps that rise, got a step"),
         (SECOND_EARLIER, "run x, column time: expected stamps that rise, got a step of -0.03 at 1"),
-        (
-            re.sub(r"x,0\.(\d\d)", r"x,\g<1>0", GOOD),
-            "run x, q of ['a']: expected new angles at 20 ",
-        ),
+        ("run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\n", "run x, q of ['a']: expected new angles at the"),
     ],
 )
 def test_read_log__names_file_and_place_of_what_is_wrong(tmp_path, text, message):
