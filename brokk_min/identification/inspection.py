@@ -60,9 +60,9 @@ def inspect(log: Log) -> dict[str, JointReport]:
     for j, name in enumerate(tqdm(log.joints, desc="inspect", unit="joint", disable=None)):
         recordings = [one for one in log.recordings if logs.driven(one)[j]]
         if recordings:
-            motion, rows = motion_of(recordings, j, log.rate), samples.moves[:, j]
-            q, q_dot = samples.q[rows, j], samples.q_dot[rows, j]
-            signs = [sign(motion_of([one], j, log.rate)) for one in recordings]
+            rows = samples.moves[:, j]
+            u, q, q_dot = (x[rows, j] for x in (samples.u, samples.q, samples.q_dot))
+            signs = [sign(one.u[:, j], one.q_dot[:, j], log.rate) for one in recordings]
             reports[name] = JointReport(
                 minutes=len(q) / log.rate / 60,
                 low=q.min(),
@@ -70,10 +70,34 @@ def inspect(log: Log) -> dict[str, JointReport]:
                 fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
                 opposite=[one.name for one, s in zip(recordings, signs, strict=True) if s < 0],
                 follows=followed_joints(log, samples, j),
-                sign=sign(motion),
-                **fit_model(motion),
+                sign=sign(u, q_dot, log.rate),
+                **fit_model(motion_of(recordings, j, log.rate)),
             )
     return reports
+
+
+def sign(u: Array, q_dot: Array, rate: float) -> int:
+    """That of velocities (T,) under positive commands; 0: not clear.
+
+    Both are means over a second, because fast sines fit reversed as well.
+    """
+    second = np.ones(round(rate)) / round(rate)
+    agreement = np.convolve(u, second, "same") @ np.convolve(q_dot, second, "same")
+    clear = abs(agreement) > CLEAR_SIGN * np.linalg.norm(u) * np.linalg.norm(q_dot)
+    return int(np.sign(agreement)) if clear else 0
+
+
+def followed_joints(log: Log, samples: Samples, j: int) -> dict[str, float]:
+    """Joints with which joint `j` moves at their speed while it has no commands, and the slopes."""
+    second = np.ones(round(log.rate))
+    recent = np.convolve(np.abs(samples.u[:, j]) > logs.COMMANDED, second)[: len(samples.u)]
+    q_dot = np.where(recent[:, None] == 0, samples.q_dot, 0.0)
+    power = np.square(q_dot).sum(axis=0)
+    slopes = q_dot.T @ q_dot[:, j] / np.maximum(power, 1e-12)
+    errors = np.where(q_dot != 0, q_dot[:, [j]] - slopes * q_dot, 0.0)
+    close = np.square(errors).sum(axis=0) < (1 - FOLLOWS) * slopes**2 * power
+    follows = close & (np.abs(slopes) > FOLLOWS) & (np.arange(len(slopes)) != j)
+    return {log.joints[i]: float(slopes[i]) for i in np.flatnonzero(follows)}
 
 
 class Motion(NamedTuple):
@@ -94,30 +118,6 @@ def motion_of(recordings: list[Recording], j: int, rate: float) -> Motion:
     q_next, margin = np.append(q[1:], q[-1]), AT_STOP * np.ptp(q)
     counts &= (q_next > q.min() + margin) & (q_next < q.max() - margin)
     return Motion(u, (q_next - q) * rate * counts, counts, rate)
-
-
-def sign(motion: Motion) -> int:
-    """That of velocities under positive commands; 0: not clear.
-
-    Both are means over a second, because fast sines fit reversed as well.
-    """
-    second = np.ones(round(motion.rate)) / round(motion.rate)
-    u, velocity = (np.convolve(x, second, "same") for x in (motion.u, motion.velocity))
-    size = np.linalg.norm(motion.u) * np.linalg.norm(motion.velocity)
-    return int(np.sign(u @ velocity)) if abs(u @ velocity) > CLEAR_SIGN * size else 0
-
-
-def followed_joints(log: Log, samples: Samples, j: int) -> dict[str, float]:
-    """Joints with which joint `j` moves at their speed while it has no commands, and the slopes."""
-    second = np.ones(round(log.rate))
-    recent = np.convolve(np.abs(samples.u[:, j]) > logs.COMMANDED, second)[: len(samples.u)]
-    q_dot = np.where(recent[:, None] == 0, samples.q_dot, 0.0)
-    power = np.square(q_dot).sum(axis=0)
-    slopes = q_dot.T @ q_dot[:, j] / np.maximum(power, 1e-12)
-    errors = np.where(q_dot != 0, q_dot[:, [j]] - slopes * q_dot, 0.0)
-    close = np.square(errors).sum(axis=0) < (1 - FOLLOWS) * slopes**2 * power
-    follows = close & (np.abs(slopes) > FOLLOWS) & (np.arange(len(slopes)) != j)
-    return {log.joints[i]: float(slopes[i]) for i in np.flatnonzero(follows)}
 
 
 def fit_model(motion: Motion) -> dict[str, Any]:
@@ -142,8 +142,8 @@ def unexplained(motion: Motion, lag: tuple[int, float], zones: Array) -> float:
     x = lfilter([1 - a], [1, -a], openings)[:, motion.counts]  # velocities if the gains are 1
     velocity = motion.velocity[motion.counts]
     gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
-    error = velocity - gains @ x
-    return float(error @ error) / max(float(velocity @ velocity), 1e-12)
+    error, power = velocity - gains @ x, float(velocity @ velocity)
+    return float(error @ error) / power if power else 1.0
 
 
 def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:

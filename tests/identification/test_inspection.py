@@ -71,9 +71,9 @@ def test_inspect__has_the_fastest_motions_of_the_log():
 
 
 def test_inspect__leaves_out_joints_without_commands_and_directions_without_motion():
-    still = record("boom", holds())._replace(q=np.zeros((4000, 2)))
+    still = record("boom", holds())._replace(q=np.zeros((4000, 2)), q_dot=np.zeros((4000, 2)))
     report = inspect(log_of(still))["boom"]
-    assert report.sign == 0
+    assert (report.explained, report.sign) == (0, 0)
     upwards = inspect(log_of(record("boom", np.abs(holds()))))
     assert list(upwards) == ["boom"]
     assert upwards["boom"].dead_zone[0] == pytest.approx(0.12, abs=0.011)
