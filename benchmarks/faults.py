@@ -72,7 +72,8 @@ def frozen_times(counts: int, moving: bool, rng: np.random.Generator) -> np.ndar
     plant = PLANT.reset(m, low + (high - low) * fraction[:, None])
     moment = rng.uniform(0, 1, num)  # of tick `first`
     frozen = np.rint(plant.q / m.encoder_step).astype(int)
-    gate, found = gate_start(m, (num,))._replace(place=frozen), np.full(num, np.inf)
+    sent = gate_start(m).sent[None].repeat(num, axis=0)
+    gate, found = gate_start(m)._replace(place=frozen, sent=sent), np.full(num, np.inf)
     for tick in range(first + 60):
         q = plant.q
         place, motion = expected_motion(m, gate, frozen)

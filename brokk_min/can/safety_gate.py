@@ -28,19 +28,19 @@ SLOWEST = 0.4  # of the fastest motion: long lever arm, weak pump
 
 
 class GateState(NamedTuple):
-    """What the gate remembers: one or many gates, arrays (...) unless noted."""
+    """What the gate remembers, with the values of its start; arrays (...) unless noted."""
 
-    driving: Array  # may the valves move?
-    armed_once: Array  # before, nothing is sent
-    active_fault: Array  # words of this tick's, see `fault_table`; empty: ready
-    latched_fault: Array  # words of what stopped it, until it is armed again; empty: nothing
-    enable: Array  # dead-man switch at the last tick with device and without error
-    time: Array  # s, of the last tick
-    counter: Array  # of the last valve frame
     counts: Array  # newest angles [encoder counts], (..., n)
     sent: Array  # commands of `OPENING_TIME`, newest last [counts of 127], (..., n, ticks)
     place: Array  # counts that the encoder has stayed at, (..., n)
     motion: Array  # of the joint since it came there, at least [rad], (..., n)
+    driving: Array = np.array(False)  # may the valves move?
+    armed_once: Array = np.array(False)  # before, nothing is sent
+    active_fault: Array = np.array("switched on")  # words of this tick's; empty: ready
+    latched_fault: Array = np.array("")  # words of what stopped it, until it is armed again
+    enable: Array = np.array(True)  # dead-man switch at the last tick with device, without error
+    time: Array = np.array(-np.inf)  # s, of the last tick
+    counter: Array = np.array(0)  # of the last valve frame
 
 
 class GateInputs(NamedTuple):
@@ -60,23 +60,11 @@ class GateInputs(NamedTuple):
     other_sender: Array  # SYNC, NMT or valve frames that the loop did not send?
 
 
-def gate_start(machine: Machine, shape: tuple[int, ...] = ()) -> GateState:
-    """Gates that have just been switched on."""
-    no = np.zeros(shape, bool)
-    zero = np.zeros(shape, int)
-    return GateState(
-        driving=no,
-        armed_once=no,
-        active_fault=np.full(shape, "switched on"),
-        latched_fault=np.full(shape, ""),
-        enable=~no,
-        time=np.full(shape, -np.inf),
-        counter=zero,
-        counts=np.zeros((*shape, machine.n), int),
-        sent=np.zeros((*shape, machine.n, int(np.ceil(OPENING_TIME * machine.rate))), int),
-        place=np.zeros((*shape, machine.n), int),
-        motion=np.zeros((*shape, machine.n)),
-    )
+def gate_start(machine: Machine) -> GateState:
+    """A gate that has just been switched on."""
+    zero = np.zeros(machine.n, int)
+    sent = np.zeros((machine.n, int(np.ceil(OPENING_TIME * machine.rate))), int)
+    return GateState(counts=zero, sent=sent, place=zero, motion=np.zeros(machine.n))
 
 
 def gate(
@@ -99,6 +87,10 @@ def gate(
     counter = (state.counter + 1) % 256
     trusted = inputs.alive & ~inputs.error  # a lost device is no release of the switch
     state = GateState(
+        counts=inputs.counts,
+        sent=np.concatenate([state.sent[..., 1:], command[..., None]], axis=-1),
+        place=place,
+        motion=motion,
         driving=driving,
         armed_once=state.armed_once | driving,
         active_fault=fault,
@@ -106,10 +98,6 @@ def gate(
         enable=inputs.enable | (state.enable & ~trusted),
         time=now,
         counter=counter,
-        counts=inputs.counts,
-        sent=np.concatenate([state.sent[..., 1:], command[..., None]], axis=-1),
-        place=place,
-        motion=motion,
     )
     return state, valve_frame(command, counter, driving)
 

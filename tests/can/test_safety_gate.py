@@ -20,9 +20,8 @@ def tight_machine():
     def edge(near, margin):
         """A limit near `near` to which adding `margin` gives a whole number of counts."""
         whole = (np.arange(3000) - 1500) * STEP
-        limits = whole - margin
-        hits = limits[limits + margin == whole]
-        return float(hits[np.argmin(np.abs(hits - near))])
+        hits = [x - margin for x in whole.tolist() if x - margin + margin == x]
+        return min(hits, key=lambda x: abs(x - near))
 
     margins = [(-0.05, 0.05), (-0.05, 0.05), (0.02, -0.02), (-0.05, -0.02), (0.02, 0.05)]
     joints = tuple(
@@ -117,82 +116,80 @@ def plain_gate(machine, s, i, now):
     return state, [*(x if x >= 0 else 255 + x for x in m), counter, int(driving)]
 
 
-class Cases:
-    """Random states and inputs, mostly sound, each with about one value on or next to a border."""
+def some(rng, p, *shape):
+    return rng.random((*SHAPE, *shape)) < p
 
-    def __init__(self, machine, seed):
-        self.machine, self.rng = machine, np.random.default_rng(seed)
-        self.inputs = self.draw_inputs()
-        self.state = self.draw_state()
 
-    def some(self, p, *shape):
-        return self.rng.random((*SHAPE, *shape)) < p
+def put(rng, array, p, *values):
+    chosen = rng.choice(values, array.shape)
+    return np.where(rng.random(array.shape) < p, chosen, array)
 
-    def put(self, array, p, *values):
-        chosen = self.rng.choice(values, array.shape)
-        return np.where(self.rng.random(array.shape) < p, chosen, array)
 
-    def draw_inputs(self):
-        rng, n = self.rng, self.machine.n
-        low, high = self.machine.column("q_min"), self.machine.column("q_max")
-        borders = [np.rint(x / STEP) for x in (low - 0.05, low + 0.02, high - 0.02, high + 0.05)]
-        near = np.stack(borders, -1)[np.arange(n), rng.integers(0, 4, (*SHAPE, n))]
-        near = near + rng.integers(-2, 3, (*SHAPE, n))
-        middle = np.rint((low + high) / 2 / STEP) + rng.integers(-9, 10, (*SHAPE, n))
-        m = np.where(self.some(0.5, n), rng.integers(-80, 81, (*SHAPE, n)), 0).astype(float)
-        m = self.put(m, 0.3, -80, 80)
-        m[..., self.machine.locked] = 0
-        heartbeat = -rng.uniform(0, 0.1, (*SHAPE, n + 1))
-        return GateInputs(
-            command=self.put(m, 0.01, np.nan, np.inf, -np.inf, 1e300, 81, -81, 80.5, 1, -1),
-            counts=np.where(self.some(0.3, n), near, middle).astype(int),
-            frames=self.put(np.ones((*SHAPE, n), int), 0.01, 0, 2, 3),
-            heartbeat=self.put(heartbeat, 0.01, -0.110, -0.110 - 1e-9, -np.inf, 0.049, 1.0, np.nan),
-            nmt=self.put(np.full((*SHAPE, n + 1), 5), 0.01, 0, 4, 6, 127),
-            enable=self.some(0.8),
-            centred=self.some(0.7),
-            alive=~self.some(0.03),
-            stop=self.some(0.03),
-            error=self.some(0.03),
-            flooded=self.some(0.02),
-            other_sender=self.some(0.02),
-        )
+def draw_inputs(machine, rng):
+    """Random inputs, mostly sound, each with about one value on or next to a border."""
+    n, low, high = machine.n, machine.column("q_min"), machine.column("q_max")
+    borders = [np.rint(x / STEP) for x in (low - 0.05, low + 0.02, high - 0.02, high + 0.05)]
+    near = np.stack(borders, -1)[np.arange(n), rng.integers(0, 4, (*SHAPE, n))]
+    near = near + rng.integers(-2, 3, (*SHAPE, n))
+    middle = np.rint((low + high) / 2 / STEP) + rng.integers(-9, 10, (*SHAPE, n))
+    m = np.where(some(rng, 0.5, n), rng.integers(-80, 81, (*SHAPE, n)), 0).astype(float)
+    m = put(rng, m, 0.3, -80, 80)
+    m[..., machine.locked] = 0
+    beats = -rng.uniform(0, 0.1, (*SHAPE, n + 1))
+    return GateInputs(
+        command=put(rng, m, 0.01, np.nan, np.inf, -np.inf, 1e300, 81, -81, 80.5, 1, -1),
+        counts=np.where(some(rng, 0.3, n), near, middle).astype(int),
+        frames=put(rng, np.ones((*SHAPE, n), int), 0.01, 0, 2, 3),
+        heartbeat=put(rng, beats, 0.01, -0.110, -0.110 - 1e-9, -np.inf, 0.049, 1.0, np.nan),
+        nmt=put(rng, np.full((*SHAPE, n + 1), 5), 0.01, 0, 4, 6, 127),
+        enable=some(rng, 0.8),
+        centred=some(rng, 0.7),
+        alive=~some(rng, 0.03),
+        stop=some(rng, 0.03),
+        error=some(rng, 0.03),
+        flooded=some(rng, 0.02),
+        other_sender=some(rng, 0.02),
+    )
 
-    def draw_state(self):
-        rng, n = self.rng, self.machine.n
-        fastest = np.floor((2 * self.machine.q_dot_max * DT + 0.0045) / STEP + 1).astype(int)
-        jump = rng.choice([-1, 1], (*SHAPE, n)) * (fastest + rng.integers(-1, 2, (*SHAPE, n)))
-        step = np.where(self.some(0.5, n), 0, rng.integers(-3, 4, (*SHAPE, n)))
-        last = self.inputs.counts - np.where(self.some(0.03, n), jump, step)
-        # commands: to one side for some ticks, or not; now and then one to the other side
-        odds = [0.01, 0.3, 0.19, 0.3, 0.2]
-        sides = rng.choice([-1, 1], (*SHAPE, n, 1))
-        push = sides * rng.choice([12, 13, 14, 40, 80], (*SHAPE, n, 9), p=odds)
-        pushed = np.arange(9, 0, -1) <= rng.choice([0, 7, 8, 9], (*SHAPE, n, 1))
-        sent = np.where(pushed, push, rng.integers(-80, 81, (*SHAPE, n, 9)))
-        late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, np.nan, -1.0)
-        return GateState(
-            driving=self.some(0.6),
-            armed_once=self.some(0.5),
-            active_fault=rng.choice(["", "error"], SHAPE),
-            latched_fault=rng.choice(["", "q4: jumped"], SHAPE),
-            enable=self.some(0.5),
-            time=-self.put(np.full(SHAPE, DT), 0.1, *late),
-            counter=rng.choice([0, 1, 127, 254, 255], SHAPE),
-            counts=last,
-            sent=np.where(self.some(0.02, n, 9), -sent, sent),
-            place=self.inputs.counts + rng.integers(-2, 3, (*SHAPE, n)),
-            motion=STEP * rng.choice([0.0, 1.5, 2.7, 3.2], (*SHAPE, n), p=[0.7, 0.15, 0.1, 0.05]),
-        )
+
+def draw_state(machine, rng, counts):
+    """Random states a tick before encoders at `counts`, in the same way."""
+    n = machine.n
+    fastest = np.floor((2 * machine.q_dot_max * DT + 0.0045) / STEP + 1).astype(int)
+    jump = rng.choice([-1, 1], (*SHAPE, n)) * (fastest + rng.integers(-1, 2, (*SHAPE, n)))
+    step = np.where(some(rng, 0.5, n), 0, rng.integers(-3, 4, (*SHAPE, n)))
+    last = counts - np.where(some(rng, 0.03, n), jump, step)
+    # commands: to one side for some ticks, or not; now and then one to the other side
+    odds = [0.01, 0.3, 0.19, 0.3, 0.2]
+    sides = rng.choice([-1, 1], (*SHAPE, n, 1))
+    push = sides * rng.choice([12, 13, 14, 40, 80], (*SHAPE, n, 9), p=odds)
+    pushed = np.arange(9, 0, -1) <= rng.choice([0, 7, 8, 9], (*SHAPE, n, 1))
+    sent = np.where(pushed, push, rng.integers(-80, 81, (*SHAPE, n, 9)))
+    late = (0.5 * DT, 0.5 * DT - 1e-9, 1.5 * DT + 1e-9, 0.074, 0.026, np.inf, np.nan, -1.0)
+    return GateState(
+        driving=some(rng, 0.6),
+        armed_once=some(rng, 0.5),
+        active_fault=rng.choice(["", "error"], SHAPE),
+        latched_fault=rng.choice(["", "q4: jumped"], SHAPE),
+        enable=some(rng, 0.5),
+        time=-put(rng, np.full(SHAPE, DT), 0.1, *late),
+        counter=rng.choice([0, 1, 127, 254, 255], SHAPE),
+        counts=last,
+        sent=np.where(some(rng, 0.02, n, 9), -sent, sent),
+        place=counts + rng.integers(-2, 3, (*SHAPE, n)),
+        motion=STEP * rng.choice([0.0, 1.5, 2.7, 3.2], (*SHAPE, n), p=[0.7, 0.15, 0.1, 0.05]),
+    )
 
 
 @pytest.mark.parametrize(("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1)])
 def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
-    cases = Cases(machine, seed)
-    state, frame = gate(machine, cases.state, cases.inputs, np.zeros(SHAPE))
+    rng = np.random.default_rng(seed)
+    inputs = draw_inputs(machine, rng)
+    before = draw_state(machine, rng, inputs.counts)
+    state, frame = gate(machine, before, inputs, np.zeros(SHAPE))
     results = []
     for row in np.ndindex(SHAPE):
-        given = [type(part)(*(x[row] for x in part)) for part in (cases.state, cases.inputs)]
+        given = [type(part)(*(x[row] for x in part)) for part in (before, inputs)]
         results.append(plain_gate(machine, *given, 0))
     expected, frames = zip(*results, strict=True)
     assert frame.dtype == np.uint8
