@@ -8,6 +8,7 @@ from typing import Any
 # Before NumPy is imported: its BLAS threads, waiting for work, would take the cores from torch's.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ["MPLBACKEND"] = "agg"  # we draw into files; a notebook's would be refused
+os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
 import tyro
 

@@ -9,7 +9,7 @@ are asked again with one term changed. Look first at the term after whose change
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import combinations, groupby, product
+from itertools import combinations, pairwise, product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,9 +43,11 @@ class Term(NamedTuple):
 
 def read_ticks(machine: Machine, log: Path) -> list[Telemetry]:
     """The longest stretch of ticks with all positions."""
-    ticks = read_telemetry(machine, read_frames(log))
-    groups = groupby(ticks, lambda tick: np.isfinite(tick.q).all())
-    return max((list(ticks) for complete, ticks in groups if complete), key=len)
+    ticks = list(read_telemetry(machine, read_frames(log)))
+    steps = np.diff([tick.time for tick in ticks])
+    gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) + 1
+    first, end = max(pairwise([0, *gaps, len(ticks)]), key=lambda ends: ends[1] - ends[0])
+    return ticks[first:end]
 
 
 def diagnose(machine: Machine, policy: Policy, ticks: list[Telemetry]) -> list[Term]:

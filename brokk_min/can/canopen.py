@@ -82,11 +82,10 @@ class Nodes:
         if frame.id in self.position_index:
             i = self.position_index[frame.id]
             raw = int.from_bytes(frame.data, "little")
-            if len(frame.data) == 4 and raw != NO_POSITION:
-                self.frames[i] += 1
+            sound = len(frame.data) == 4 and raw != NO_POSITION
+            self.frames[i] += 1 if sound else 2
+            if sound:
                 self.raw[i] = raw
-            else:
-                self.frames[i] += 2
         elif frame.id in self.heartbeat_index and len(frame.data) == 1:
             i = self.heartbeat_index[frame.id]
             self.heartbeat[i] = frame.time
@@ -97,7 +96,7 @@ class Nodes:
 
 
 def check_bus(machine: Machine) -> None:
-    """ValueError: too many joints, an identifier twice, slow ticks, or joints beyond a turn."""
+    """ValueError: too many joints, an identifier twice, slow ticks, or a joint beyond a turn."""
     require(machine.n <= MOST_JOINTS, "joints", f"at most {MOST_JOINTS} on a bus", machine.n)
     nodes, valves = node_numbers(machine), machine.valve_frame_id
     bases = (EMERGENCY, TPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
@@ -105,9 +104,10 @@ def check_bus(machine: Machine) -> None:
     free = valves < WOULD_SEND and valves not in others
     require(free, "valve_frame_id", "an identifier of no other frame", f"0x{valves:03X}")
     for joint in machine.joints:
-        require(joint.kind == "revolute", f"{joint.name}.kind", "revolute on a bus", joint.kind)
-        width = joint.q_max - joint.q_min  # less than a turn
-        require(width < 6.18, f"{joint.name}.q_max", "a range below 6.18 rad", f"{width:.2f} rad")
+        width = joint.q_max - joint.q_min
+        fits = joint.kind == "revolute" and width < 6.18  # less than a turn
+        got = f"{joint.kind}, {width:.2f}"
+        require(fits, joint.name, "revolute, with a range below 6.18 rad, on a bus", got)
     slowest = 1.5 / WATCHDOG  # Hz, because a tick may be late by half
     require(machine.rate >= slowest, "rate", f"{slowest:g} Hz or more (watchdog)", machine.rate)
 
@@ -118,10 +118,7 @@ def node_numbers(machine: Machine) -> list[int]:
 
 
 def set_up_nodes(bus: Any, machine: Machine) -> None:
-    """Check the encoders, set their heartbeats, let them answer each SYNC, and start all nodes.
-
-    ValueError: an encoder that does not answer, or not as the machine says; see also `check_bus`.
-    """
+    """Check and set up the encoders, and start all nodes; ValueError: an encoder does not fit."""
     check_bus(machine)
     for joint in machine.joints:
         for (index, sub), (value, meaning) in encoder_objects(machine, joint.encoder_node).items():
@@ -150,10 +147,7 @@ def encoder_objects(machine: Machine, node: int) -> dict[tuple[int, int], tuple[
 
 
 def sdo(bus: Any, node: int, address: tuple[int, int], data: bytes = b"") -> int:
-    """Read an object of a node by its index and subindex, or write up to four bytes to it.
-
-    ValueError: the node does not answer, or refuses.
-    """
+    """Read an object by index and subindex, or write up to four bytes; ValueError: no answer."""
     command = 0x23 | (4 - len(data)) << 2 if data else 0x40
     request = struct.pack("<BHB4s", command, *address, data)
     bus.send(SDO_REQUEST + node, request)

@@ -27,11 +27,10 @@ class Bus:
     allowed: Container[int] = range(0x800)  # identifiers of frames that it sends
 
     def __post_init__(self) -> None:
-        can = require_package("can", "hw")
+        self.can = require_package("can", "hw")
         self.start = time.time() - self.clock()  # the log has the time of day, but it may be set
         self.echoes: deque[tuple[int, bytes]] = deque(maxlen=64 if self.echo else 0)
-        self.writer = can.CanutilsLogWriter(self.log or os.devnull)
-        self.message = can.Message
+        self.writer = self.can.CanutilsLogWriter(self.log or os.devnull)
 
     def now(self) -> float:
         """Time of day at the start plus monotonic time since [s], in whole microseconds."""
@@ -45,13 +44,13 @@ class Bus:
             message = self.bus.recv(left)  # its timeout follows the time of day, which may be set
         if message is None:
             return None
-        now, data = self.now(), bytes(message.data)
-        if (message.arbitration_id, data) in self.echoes:
-            self.echoes.remove((message.arbitration_id, data))
-            return Frame(now, -1, data)
-        self._log(message, now, self.name)
-        other = message.is_remote_frame or message.is_error_frame or message.is_fd
-        return Frame(now, -1 if other or message.is_extended_id else message.arbitration_id, data)
+        message.timestamp, message.channel = self.now(), self.name
+        frame = plain_frame(message)
+        if (frame.id, frame.data) in self.echoes:
+            self.echoes.remove((frame.id, frame.data))
+            return frame._replace(id=-1)
+        self.writer(message)
+        return frame
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame, once; never periodically, because the kernel would go on after a hang.
@@ -59,27 +58,24 @@ class Bus:
         A frame that is not `allowed` is in the log alone, with the identifier `WOULD_SEND`.
         """
         if can_id not in self.allowed:
-            self._log(self._message(WOULD_SEND, data), self.now(), "shadow")
+            self.writer(self._message(WOULD_SEND, data, "shadow"))
             return
-        message = self._message(can_id, data)
+        message = self._message(can_id, data, self.name)
         self.bus.send(message, timeout=0.01)
         self.echoes.append((can_id, data))
-        self._log(message, self.now(), self.name)
+        self.writer(message)
 
     def log_input(self, data: bytes) -> None:
         """Log the operator's input, which is not on the bus."""
-        self._log(self._message(OPERATOR_INPUT, data), self.now(), "operator")
+        self.writer(self._message(OPERATOR_INPUT, data, "operator"))
 
     def flush(self) -> None:
         """Write the log on, so that it survives the program's sudden end. OSError: a full disk."""
         self.writer.file.flush()
 
-    def _message(self, can_id: int, data: bytes) -> Any:
-        return self.message(arbitration_id=can_id, data=data, is_extended_id=False, is_rx=False)
-
-    def _log(self, message: Any, now: float, channel: str) -> None:
-        message.timestamp, message.channel = now, channel
-        self.writer.on_message_received(message)
+    def _message(self, can_id: int, data: bytes, channel: str) -> Any:
+        ours = {"is_extended_id": False, "is_rx": False, "timestamp": self.now()}
+        return self.can.Message(arbitration_id=can_id, data=data, channel=channel, **ours)
 
     def close(self) -> None:
         """Close bus and log, the log even if the bus fails."""
@@ -89,12 +85,16 @@ class Bus:
             self.writer.stop()
 
 
+def plain_frame(message: Any) -> Frame:
+    """A message of python-can as a frame; -1 for what is no data frame of 11 bits."""
+    other = message.is_remote_frame or message.is_error_frame or message.is_fd
+    can_id = -1 if other or message.is_extended_id else message.arbitration_id
+    return Frame(message.timestamp, can_id, bytes(message.data), not message.is_rx)
+
+
 @contextmanager
 def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[Bus]:
-    """A bus by python-can's names, closed at the end of the block; `log` grows while it runs.
-
-    ValueError: python-can is not installed, finds no such bus, or fails in the block.
-    """
+    """A bus by python-can's names, until the end of the block; ValueError: no bus, or it fails."""
     can = require_package("can", "hw")
     can.log.setLevel("ERROR")  # it also warns of a bus that it could not open
     where = f"{interface} {channel}: expected a CAN bus"
@@ -114,10 +114,10 @@ def stop_signals() -> Iterator[list[int]]:
     """A list to which SIGINT, SIGTERM and SIGHUP are appended, instead of ending the program."""
     received: list[int] = []
     names = ("SIGINT", "SIGTERM", "SIGHUP")  # the last: a terminal was closed; not on Windows
-    numbers = [number for number in signal.Signals if number.name in names]
-    handlers = [signal.signal(n, lambda number, _: received.append(number)) for n in numbers]
+    ends = [number for number in signal.Signals if number.name in names]
+    handlers = {n: signal.signal(n, lambda number, _: received.append(number)) for n in ends}
     try:
         yield received
     finally:
-        for number, handler in zip(numbers, handlers):
+        for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -1,7 +1,4 @@
-"""The log of a drive: its frames, what they say of each tick, and recordings for `fit`.
-
-Logs are those of candump, and those of other tools that python-can reads (ASC, BLF, TRC, gzip).
-"""
+"""The log of a drive: its frames, what they say of each tick, and recordings for `fit`."""
 
 import re
 import struct
@@ -14,6 +11,7 @@ import numpy as np
 from brokk_min._files import brief, expected, require_package
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame, Nodes
+from brokk_min.can.connection import plain_frame
 from brokk_min.identification.logs import Log, machine_log
 from brokk_min.identification.readings import FASTER, NOISE
 from brokk_min.machine import Array, Machine, require
@@ -34,7 +32,9 @@ def read_frames(path: Path) -> Iterator[Frame]:
     killed. ValueError: no such log, or a line without a time.
     """
     if Path(path).suffix.lower() in OTHERS:
-        yield from other_frames(path)
+        reader = require_package("can", "hw").LogReader
+        with expected(path, "a log that python-can reads"), reader(path) as messages:
+            yield from (frame for frame in map(plain_frame, messages) if frame.id >= 0)
         return
     with expected(path, "a candump log"), open(path, encoding="ascii") as file:
         for row, line in enumerate(file, 1):
@@ -42,31 +42,21 @@ def read_frames(path: Path) -> Iterator[Frame]:
             require(line.lstrip().startswith("("), f"row {row}", wanted, brief(line))
             if match := LINE.fullmatch(line):
                 time, can_id, data, direction = match.groups()
-                content = bytes.fromhex(data)
-                yield Frame(float(time), int(can_id, 16), content, direction == "T")
-
-
-def other_frames(path: Path) -> Iterator[Frame]:
-    """The data frames with 11 bits of a log that python-can reads; ValueError: it is none."""
-    reader = require_package("can", "hw").LogReader
-    with expected(path, "a log that python-can reads"), reader(path) as messages:
-        for one in messages:
-            if not (one.is_extended_id or one.is_remote_frame or one.is_error_frame or one.is_fd):
-                yield Frame(one.timestamp, one.arbitration_id, bytes(one.data), not one.is_rx)
+                yield Frame(float(time), int(can_id, 16), bytes.fromhex(data), direction == "T")
 
 
 class Telemetry(NamedTuple):
     """What a bus or a log shows of one tick."""
 
     time: float  # of its SYNC [s]
-    q: Array  # rad (n,), nan: unknown
+    q: Array  # rad (n,)
     u: Array  # in [-1, 1] (n,)
     v_goal: Array  # m/s (3,)
     driving: bool
 
 
 def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Telemetry]:
-    """Telemetry of the ticks of a log; each ends with the SYNC of the next."""
+    """Telemetry of the ticks of a log with all angles; each ends with the SYNC of the next."""
     nodes, v_goal = Nodes(machine), np.zeros(3)
     start = 0.0  # s, time of the last SYNC
     for frame in frames:
@@ -74,9 +64,9 @@ def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Teleme
         if frame.id == canopen.OPERATOR_INPUT and frame.sent:
             v_goal = np.array(struct.unpack_from("<hhh", frame.data)) / 1e4
         elif frame.id == canopen.SYNC:
-            counts = canopen.encoder_counts(machine, nodes.raw)
-            q = np.where((nodes.frames == 1).all(), counts * machine.encoder_step, np.nan)
-            yield Telemetry(start, q, nodes.u, v_goal * nodes.enable, nodes.enable)
+            if (nodes.frames == 1).all():
+                q = canopen.encoder_counts(machine, nodes.raw) * machine.encoder_step
+                yield Telemetry(start, q, nodes.u, v_goal * nodes.enable, nodes.enable)
             nodes.start_tick()
             nodes.enable = False  # until the next valve frame
             start = frame.time
@@ -87,9 +77,10 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
 
     ValueError: nothing was driven for long enough.
     """
-    ticks = [t for t in read_telemetry(machine, frames) if t.driving and np.isfinite(t.q).all()]
+    ticks = [tick for tick in read_telemetry(machine, frames) if tick.driving]
     time = np.array([tick.time for tick in ticks])
-    u, q = (np.reshape([getattr(t, name) for t in ticks], (-1, machine.n)) for name in ("u", "q"))
+    u = np.reshape([tick.u for tick in ticks], (-1, machine.n))
+    q = np.reshape([tick.q for tick in ticks], (-1, machine.n))
     reach = FASTER * machine.q_dot_max * machine.dt + NOISE  # of an angle in a tick
     gap = np.abs(np.diff(time) * machine.rate - 1) >= 0.5
     jump = (np.abs(np.diff(q, axis=0)) > reach).any(axis=1)
@@ -98,5 +89,4 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     wanted = f"{least} ticks of driving in a row at {machine.rate:g} Hz (--machine)"
     require(longest >= least, "log", wanted, f"{longest} at most")
     long = [rows for rows in pieces if len(rows) >= least]
-    named = [(f"drive_{k:03d}", u[rows], q[rows]) for k, rows in enumerate(long)]
-    return machine_log(machine, named)
+    return machine_log(machine, [(f"drive_{k:03d}", u[i], q[i]) for k, i in enumerate(long)])

@@ -1,8 +1,4 @@
-"""Operators: a script of velocity goals, or a joystick; and a controller that jogs one joint.
-
-An operator takes whether the gate drives and whether it is ready (no fault), and gives the input
-of the tick. A script holds the dead-man switch, too, so that it passes the same gate.
-"""
+"""Operators: a script of velocity goals, or a joystick; and a controller that jogs one joint."""
 
 import os
 from collections.abc import Sequence
@@ -20,10 +16,7 @@ PATIENCE = 5.0  # s that a script waits until the machine is ready
 
 
 class Script:
-    """Velocity goals (T, 3) [m/s] one after another, as soon as the gate is ready; then the end.
-
-    ValueError: a goal faster than the machine's `tool_speed`.
-    """
+    """Velocity goals (T, 3) [m/s] one by one; ValueError: faster than the machine's tool speed."""
 
     def __init__(self, machine: Machine, goals: Array) -> None:
         fastest = float(np.linalg.norm(goals, axis=-1).max())
@@ -35,7 +28,7 @@ class Script:
         self.patience = round(PATIENCE * machine.rate)  # ticks until it gives up
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
-        """Stops at the end, after a fault, or if the machine never gets ready."""
+        """Presses the switch, too; stops at the end, after a fault, or if it never gets ready."""
         if driving and not self.done:
             x, y, z = self.goals[self.tick].tolist()
             self.tick += 1
@@ -60,7 +53,6 @@ class Joystick:
     """
 
     def __init__(self, machine: Machine, axes: Sequence[int] = (1, 0, 4), button: int = 5) -> None:
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a window, or this
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         self.pygame = require_package("pygame", "play")

@@ -1,7 +1,4 @@
-"""A machine to try the hardware path on: CANopen encoders and a valve controller, a plant behind.
-
-It plays the part of a real Brokk on the bus; the program that drives it cannot tell.
-"""
+"""A simulated machine on a bus; the program that drives it cannot tell it from a real one."""
 
 import gc
 import struct
@@ -21,11 +18,9 @@ Frames = list[tuple[int, bytes]]  # identifiers and data
 
 
 class SimulatedMachine:
-    """CiA 406 encoders and a valve controller on one bus, and a plant behind them.
+    """CiA 406 encoders, a valve controller by the rules of docs/hardware.md, and a plant.
 
-    The valve controller keeps the rules of docs/hardware.md. The machine starts at angles `q` [rad]
-    (n,) at the time `now` [s], and the plant moves in steps of `machine.plant_dt`.
-    ValueError: see `canopen.check_bus`.
+    It starts at angles `q` [rad] (n,) at the time `now` [s]. ValueError: see `canopen.check_bus`.
     """
 
     def __init__(self, machine: Machine, q: ArrayLike, now: float, plant: Plant = PLANT) -> None:
@@ -130,21 +125,16 @@ def start_pose(machine: Machine) -> Array:
 
 
 def simulate(machine: Machine, interface: str, channel: str, plant: Plant = PLANT) -> None:
-    """Run a simulated machine on a bus until SIGINT or SIGTERM.
-
-    It starts at `start_pose` and prints why its valve controller stops. ValueError: no such bus.
-    """
+    """Run a simulated machine on a bus until a signal; it prints why its valve controller stops."""
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:
-        start = bus.now()
-        simulated = SimulatedMachine(machine, start_pose(machine), start, plant)
-        answers: Frames = []
+        simulated = SimulatedMachine(machine, start_pose(machine), bus.now(), plant)
         while not signals:
-            for can_id, data in answers:
-                bus.send(can_id, data)
             frame = bus.recv(max(0.0, simulated.next_step - bus.now()))
             answers = simulated.advance(bus.now())
             answers += simulated.receive(frame) if frame else []
+            for can_id, data in answers:
+                bus.send(can_id, data)
             while simulated.reasons:
-                reason = simulated.reasons.pop(0)
-                print(f"{bus.now() - start:.3f} s, valve controller stops: {reason}", flush=True)
+                time, reason = bus.now() - simulated.start, simulated.reasons.pop(0)
+                print(f"{time:.3f} s, valve controller stops: {reason}", flush=True)

@@ -1,5 +1,6 @@
 """The log of a drive as a film."""
 
+from itertools import dropwhile
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,9 @@ def film(path: Path, machine: Machine, out: Path) -> None:
 
 
 def scenes(machine: Machine, path: Path) -> list[Scene]:
-    """The ticks of a log from the first driven one on, but for those without all angles."""
-    ticks = [t for t in read_telemetry(machine, read_frames(path)) if np.isfinite(t.q).all()]
-    driving = [t.driving for t in ticks]
-    require(any(driving), str(path), "a log in which the machine is driven", "another one")
-    ticks = ticks[driving.index(True) :]
+    """The ticks of a log from the first driven one on."""
+    ticks = list(dropwhile(lambda t: not t.driving, read_telemetry(machine, read_frames(path))))
+    require(len(ticks) > 0, str(path), "a log in which the machine is driven", "another one")
     q = np.array([t.q for t in ticks])
     fk = forward_kinematics(machine, q)
     q_dot = velocity_of(q, machine.velocity_samples, machine.rate)

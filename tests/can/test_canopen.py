@@ -7,7 +7,7 @@ import canopen
 import numpy as np
 import pytest
 from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, datatypes
-from helpers_bus import START, ConstantCommand, HoldingOperator, World, eventually, only, recording
+from helpers_bus import BASELINE, START, HoldingOperator, World, eventually, only, recording
 
 from brokk_min.can.canopen import (
     Nodes,
@@ -62,13 +62,8 @@ def test_encoder_counts__is_the_inverse_of_encoder_raw_however_mounted():
     np.testing.assert_array_equal(encoder_counts(machine, raw % 4096), counts)
 
 
-@pytest.fixture
-def world():
-    return World(ConstantCommand(0, 0, 0, 0, 0), HoldingOperator())
-
-
-def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes(world):
-    out = []
+def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes():
+    world, out = World(BASELINE, HoldingOperator()), []
     world.downward = recording(out)
     world.drive.begin()
     assert [data.hex(" ") for can_id, data in out if can_id == 0x603] == [
@@ -107,7 +102,8 @@ ABORT = only(0x584, lambda data: [b"\x80" + data[1:4] + struct.pack("<I", 0x0602
         (lambda *frame: [], "node 1: object 0x6501:00: .* answer within 0.5 s, got none"),
     ],
 )
-def test_set_up_nodes__refuses_an_encoder_that_does_not_fit(upward, refusal, world):
+def test_set_up_nodes__refuses_an_encoder_that_does_not_fit(upward, refusal):
+    world = World(BASELINE, HoldingOperator())
     world.upward = upward
     with pytest.raises(ValueError, match=f"^{refusal}"):
         world.drive.begin()
@@ -119,8 +115,8 @@ def test_set_up_nodes__refuses_an_encoder_that_does_not_fit(upward, refusal, wor
         (SIX, "joints: expected at most 5 on a bus, got 6"),
         (replace(BROKK_170, valve_frame_id=0x583), "valve_frame_id: .* no other frame, got 0x583"),
         (SLOW, r"rate: expected 10 Hz or more \(watchdog\), got 5"),
-        (SLIDE, "q4.kind: expected revolute on a bus, got prismatic"),
-        (WIDE, r"q1\.q_max: expected a range below 6.18 rad, got 6.20 rad"),
+        (SLIDE, "q4: expected revolute, with a range below 6.18 rad, on a bus, got prismatic"),
+        (WIDE, "q1: expected revolute, with a range below 6.18 rad, .* got revolute, 6.20"),
     ],
 )
 def test_machines_that_do_not_fit_the_bus__are_refused_on_both_its_sides(machine, refusal):
@@ -135,20 +131,20 @@ def dictionary():
     """As much of CiA 406 as the program asks of an encoder."""
     u8, u16, u32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
     objects = ObjectDictionary()
-    for index in (0x1800, 0x1A00):
-        objects.add_object(ODRecord(f"TPDO1 {index}", index))
-    for name, index, sub, kind, value in (
-        ("heartbeat", 0x1017, 0, u16, 0),
-        ("identifier", 0x1800, 1, u32, 0x181),
-        ("transmission type", 0x1800, 2, u8, 254),
-        ("number of entries", 0x1A00, 0, u8, 1),
-        ("first entry", 0x1A00, 1, u32, 0x60040020),
-        ("position", 0x6004, 0, u32, 1234),
-        ("units per revolution", 0x6501, 0, u32, 4096),
+    for index, sub, kind, value in (
+        (0x1017, 0, u16, 0),  # heartbeat
+        (0x1800, 1, u32, 0x181),  # identifier of TPDO1
+        (0x1800, 2, u8, 254),  # transmission type
+        (0x1A00, 0, u8, 1),  # entries
+        (0x1A00, 1, u32, 0x60040020),
+        (0x6004, 0, u32, 1234),  # position
+        (0x6501, 0, u32, 4096),  # counts of a turn
     ):
-        entry = ODVariable(name, index, sub)
+        if index not in objects:
+            objects.add_object(ODRecord(f"{index:X}", index))
+        entry = ODVariable(f"{index:X}:{sub}", index, sub)
         entry.data_type, entry.default = kind, value
-        (objects[index].add_member if index in objects else objects.add_object)(entry)
+        objects[index].add_member(entry)
     return objects
 
 
