@@ -44,7 +44,6 @@ def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
         pen = ImageDraw.Draw(part)
         _backdrop(pen, machine, view)
         _arm(pen, machine, view, scene)
-        _tool(pen, machine, view, scene)
         image.paste(part, view.corner)
     pen = ImageDraw.Draw(image)
     pen.text((28, HEAD / 2), scene.title, INK, _font(30), "lm")
@@ -114,21 +113,15 @@ def _backdrop(pen: Pen, machine: Machine, view: View) -> None:
 
 
 def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
-    """Links, the first of them from the base frame's origin, and joints."""
+    """Links from the base frame's origin on, joints, the tool's trail, arrows of its velocities."""
     ends = view.project(forward_kinematics(machine, scene.q).p)
-    sizes = 0.03 * extent(machine)[0] * view.scale * np.linspace(1.0, 0.5, machine.n)
-    for i in range(machine.n):
-        pen.line(ends[i : i + 2].ravel().tolist(), BLUE, round(2 * float(sizes[i])))
-        radius = max(6.0, 0.6 * float(sizes[i]))
-        pen.regular_polygon((*ends[i], 1.2 * radius), 24, fill=INK)
-        pen.regular_polygon((*ends[i], 0.5 * radius), 24, fill=BACKGROUND)
-
-
-def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
-    """The trail of the tool, and the arrows of its velocities."""
-    tip = view.project(tool_position(forward_kinematics(machine, scene.q)))
+    radius = max(6.0, 0.02 * extent(machine)[0] * view.scale)
+    pen.line(ends.ravel().tolist(), BLUE, round(2 * radius))
+    for end in ends[:-1]:
+        pen.regular_polygon((*end, radius), 24, fill=INK)
+        pen.regular_polygon((*end, 0.5 * radius), 24, fill=BACKGROUND)
     pen.line(view.project(scene.trail).ravel().tolist(), BLUE, 5)
-    pen.regular_polygon((*tip, 8), 24, fill=INK)
+    pen.regular_polygon((*ends[-1], 8), 24, fill=INK)
     scale = 0.2 * min(view.size) / machine.tool_speed
     arrows = ((52, "measured", scene.v_tool, MEASURED), (20, "goal", scene.v_goal, INK))
     for y, name, v, colour in arrows:
@@ -138,32 +131,28 @@ def _tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
         along = scale * (view.axes @ v) * (1, -1)
         if (length := float(np.hypot(*along))) > 8:
             head = min(22.0, 0.7 * length) * along / length
-            barb = 0.45 * head[::-1] * (-1, 1)
-            neck = tip + along - head
-            pen.line([*tip, *neck], colour, 6)
-            pen.polygon([*tip + along, *neck + barb, *neck - barb], colour)
+            barb, neck = 0.45 * head[::-1] * (-1, 1), ends[-1] + along - head
+            pen.line([*ends[-1], *neck], colour, 6)
+            pen.polygon([*neck + head, *neck + barb, *neck - barb], colour)
 
 
 def _joint_row(pen: Pen, machine: Machine, scene: Scene, i: int, size: tuple[int, int]) -> None:
     """The angle of joint i within its range, and its command within the limit."""
-    joint, q = machine.joints[i], float(scene.q[i])
+    joint, q, counts = machine.joints[i], float(scene.q[i]), float(scene.u[i]) * PWM_MAX
     y = size[1] - ROW * (machine.n - i - 0.25)
     left = 40 + 18 * max(map(len, machine.names))
     length = (size[0] - left - 340) / 2  # of a bar, beside the digits
-    colour, font = INK if joint.driven else MUTED, _font(24)
-    unit = "rad" if joint.kind == "revolute" else "m"
-    pen.text((28, y), joint.name, colour, font, "lm")
+    valve = left + length + 160
+    colour = INK if joint.driven else MUTED
     at = left + length * (q - joint.q_min) / (joint.q_max - joint.q_min)
     pen.line((left, y, left + length, y), SLOT, 8)
     pen.line((at, y - 14, at, y + 14), colour, 12)
-    pen.text((left + length + 16, y), f"{q:+z.2f} {unit}", colour, font, "lm")
-    valve, counts = left + length + 160, float(scene.u[i]) * PWM_MAX
-    if not joint.driven:
-        pen.text((valve, y), "locked", MUTED, font, "lm")
-        return
     middle, deflection = valve + length / 2, counts / machine.pwm_limit * length / 2
     pen.line((valve, y, valve + length, y), SLOT, 24)
     pen.line((middle, y, middle + deflection, y), BLUE, 24)
-    pen.line((middle, y - 16, middle, y + 16), INK, 4)
-    text = f"{round(counts):+d} of {machine.pwm_limit}"
-    pen.text((valve + length + 16, y), text, INK, font, "lm")
+    pen.line((middle, y - 16, middle, y + 16), colour, 4)
+    angle = f"{q:+z.2f} rad" if joint.kind == "revolute" else f"{q:+z.2f} m"
+    command = f"{round(counts):+d} of {machine.pwm_limit}" if joint.driven else "locked"
+    texts = {28: joint.name, left + length + 16: angle, valve + length + 16: command}
+    for x, text in texts.items():
+        pen.text((x, y), text, colour, _font(24), "lm")

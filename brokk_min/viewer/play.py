@@ -1,13 +1,9 @@
-"""A window in which you drive a simulated machine by hand, with keyboard or gamepad.
-
-One loop reads the operator, lets controller and plant go on by a tick, and draws a picture, 20
-times a second. On a busy computer the machine therefore moves slower than life; nothing else
-depends on timing.
-"""
+"""A window in which you drive a simulated machine, tick by tick, with keyboard or gamepad."""
 
 import os
 from collections import deque
 from importlib import import_module
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -27,7 +23,6 @@ TRAIL = 600  # positions of the tool that are shown
 # keys for and against x, y and z, as the top view shows them, and axes of a gamepad for them
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
 AXES = (1, 0, 3)
-Y_BUTTON = 3  # of an Xbox pad
 HELP = "arrows, W, S: move    left SHIFT: slowly    TAB: the other controller    ESC: end"
 
 
@@ -41,16 +36,12 @@ class Operator:
         self.gamepads.init()  # a gamepad that is there is an event, too
 
     def handle(self, event: Any) -> str:
-        """Take in an event of pygame; does it ask to "close" or for the "other" controller?"""
-        pg = self.pygame
-        key = pg.key.name(event.key) if event.type == pg.KEYDOWN else ""
-        if event.type == pg.QUIT or key == "escape":
-            return "close"
-        if key == "tab" or (event.type == pg.CONTROLLERBUTTONDOWN and event.button == Y_BUTTON):
-            return "other"
-        if event.type == pg.CONTROLLERDEVICEADDED:
+        """Take in an event; the key that it presses, which is "escape" for a closed window, too."""
+        if event.type == self.pygame.CONTROLLERDEVICEADDED:
             self.pad = self.gamepads.Controller(event.device_index)
-        return ""
+        if event.type == self.pygame.QUIT:
+            return "escape"
+        return str(self.pygame.key.name(event.key)) if event.type == self.pygame.KEYDOWN else ""
 
     def velocity(self) -> Array:
         """Goal velocity of the tool [m/s] (3,) for the next tick."""
@@ -67,46 +58,41 @@ class Session:
     """A simulated machine, and the controller that drives it now."""
 
     def __init__(self, machine: Machine, controllers: dict[str, Controller], plant: Plant) -> None:
-        self.machine, self.controllers, self.plant = machine, controllers, plant
+        self.machine, self.plant = machine, plant
         self.state = initial_state(machine, start_pose(machine)[None], np.zeros(3), plant)
         self.trail: deque[Array] = deque(maxlen=TRAIL)  # of the tool [m]
-        self.names = deque(controllers)  # the first one drives
-        self.memory = controllers[self.names[0]].start(1)
+        self.turns = cycle(controllers.items())
+        self.switch()
 
     def switch(self) -> None:
         """The next controller goes on from here."""
-        self.names.rotate(-1)
-        self.memory = self.controllers[self.names[0]].start(1)
+        self.name, self.controller = next(self.turns)
+        self.memory = self.controller.start(1)
 
     def tick(self, v_goal: Array) -> Scene:
         """Controller and plant go on by a tick, with this goal velocity [m/s] (3,)."""
         self.state = self.state._replace(v_goal=v_goal.astype(np.float32)[None])
         measured = measure(self.machine, self.state.history, self.state.v_goal)
-        u, self.memory = self.controllers[self.names[0]](measured, self.memory)
+        u, self.memory = self.controller(measured, self.memory)
         self.state = s = transition(self.machine, self.plant, self.state, u)
         self.trail.append(tool_position(forward_kinematics(self.machine, s.q[0])))
-        tool = s.v_goal[0], s.v_tool[0], np.array(self.trail)
-        status = f"{s.ticks[0] * self.machine.dt:.1f} s"
-        return Scene(s.q[0], u[0], *tool, self.names[0], status)
+        trail, status = np.array(self.trail), f"{s.ticks[0] * self.machine.dt:.1f} s"
+        return Scene(s.q[0], u[0], s.v_goal[0], s.v_tool[0], trail, self.name, status)
 
 
 def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PLANT) -> None:
-    """Drive a simulated machine in a window, until it is closed.
-
-    The window shows the names of the `controllers`. ValueError: no pygame, or no display.
-    """
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    """Drive a simulated machine in a window, until it is closed; ValueError: no display."""
     pygame = require_package("pygame", "play")
     window = open_window(pygame)
     session, operator = Session(machine, controllers, plant), Operator(machine, pygame)
     clock = pygame.time.Clock()
     while True:
         for event in pygame.event.get():
-            action = operator.handle(event)
-            if action == "close":
+            key = operator.handle(event)
+            if key == "escape":
                 pygame.display.quit()
                 return
-            if action == "other":
+            if key == "tab":
                 session.switch()
         scene = session.tick(operator.velocity())
         pixels = draw(machine, scene, SIZE).tobytes()
@@ -116,12 +102,8 @@ def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PL
 
 
 def open_window(pygame: Any) -> Any:
-    """The surface of a new window.
-
-    Without a display SDL would draw unseen; that is refused unless SDL_VIDEODRIVER asks for it.
-    """
+    """A new window; without a display SDL would draw unseen, if SDL_VIDEODRIVER asks for it."""
     try:
-        pygame.display.init()
         window = pygame.display.set_mode(SIZE)
     except pygame.error as error:
         raise ValueError(f"window: expected a display, got {error}") from error

@@ -34,10 +34,11 @@ def operator(monkeypatch):
     return Operator(BROKK_170, pygame)
 
 
-def look(operator):
-    """Take in the events; what they ask for, and the goal velocity."""
-    actions = [operator.handle(event) for event in pygame.event.get()]
-    return [action for action in actions if action], operator.velocity()
+def velocity(operator):
+    """The goal velocity after all events."""
+    for event in pygame.event.get():
+        operator.handle(event)
+    return operator.velocity()
 
 
 @pytest.mark.parametrize(
@@ -58,38 +59,33 @@ def test_velocity__is_that_of_the_keys_and_at_most_the_tool_speed(operator, held
 def test_gamepad__drives_until_it_is_unplugged(operator):
     """A trigger at its end moves nothing."""
     device = Virtual(buttons=15, kind=1)
-    look(operator)
-    device.axis(1, -1.0)  # forward
-    device.axis(3, 1.0)  # down
-    device.axis(4, -1.0)
-    device.button(3, True)
-    actions, velocity = look(operator)
-    np.testing.assert_allclose(velocity, 0.3 * np.array([1, 0, -1]) / 2**0.5, atol=1e-6)
-    assert actions == ["other"]
+    assert not velocity(operator).any()
+    for axis, value in ((1, -1.0), (3, 1.0), (4, -1.0)):  # forward, down, a trigger
+        device.axis(axis, value)
+    expected = 0.3 * np.array([1, 0, -1]) / 2**0.5
+    np.testing.assert_allclose(velocity(operator), expected, atol=1e-6)
     device.unplug()
-    assert not look(operator)[1].any()
+    assert not velocity(operator).any()
 
 
 def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch, held):
     """In real time: arrow key, and through pygame's queue the other controller, and closing."""
     scenes, draw = [], play.draw
+    tab = pygame.event.Event(pygame.KEYDOWN, key=pygame.K_TAB)
+    events = {20: tab, 22: pygame.event.Event(pygame.QUIT)}
 
     def each_picture(machine, scene, size):
         scenes.append(scene)
         held.add("left")
-        for at, name in ((20, "tab"), (22, "escape")):
-            if len(scenes) == at:
-                code = pygame.key.key_code(name)
-                pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=code))
+        if len(scenes) in events:
+            pygame.event.post(events[len(scenes)])
         return draw(machine, scene, size)
 
     monkeypatch.setattr(play, "draw", each_picture)
     assert run("play") == 0
     titles = [TITLES["rl"]] * 20 + [TITLES["jacobian_pid_k0.1"]] * 2
     assert [scene.title for scene in scenes] == titles
-    last = scenes[19]
-    assert last.v_tool[1] > 0.1 and last.u.any()
-    assert last.status == "1.0 s"
+    assert scenes[19].v_tool[1] > 0.1 and scenes[19].u.any() and scenes[19].status == "1.0 s"
     fk = forward_kinematics(BROKK_170, np.array([scene.q for scene in scenes]))
     np.testing.assert_allclose(scenes[-1].trail, tool_position(fk))
     np.testing.assert_allclose([scene.v_goal for scene in scenes[-2:]], 2 * [[0, 0.3, 0]])
