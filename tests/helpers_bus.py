@@ -55,15 +55,7 @@ def unchanged(can_id, data):
 
 def only(changed_id, act):
     """Change the frames of one identifier."""
-    return lambda can_id, data: [
-        (can_id, d) for d in (act(data) if can_id == changed_id else [data])
-    ]
-
-
-def once(act):
-    """Change the first frame alone."""
-    acts = iter([act])
-    return lambda data: next(acts, lambda data: [data])(data)
+    return lambda i, data: [(i, d) for d in (act(data) if i == changed_id else [data])]
 
 
 def recording(out):
@@ -98,7 +90,6 @@ class World:
     """
 
     step = 0.001  # s
-    offset = 0.0  # s, of the program's clock
 
     def __init__(self, controller, operator, log=None):
         self.time = 0.0  # s
@@ -108,13 +99,10 @@ class World:
         self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond
         self.syncs = []
-        self.bus = Bus(self, "virtual", log, clock=self.clock, sleep=self.sleep)
+        self.bus = Bus(self, "virtual", log, clock=lambda: self.time, sleep=self.sleep)
         self.bus.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
         self.drive = Drive(BROKK_170, controller, self.bus, operator)
         self.controller, self.operator = controller, operator
-
-    def clock(self):
-        return self.time + self.offset
 
     def send(self, message, timeout=None):
         frames = self.downward(message.arbitration_id, bytes(message.data))
@@ -125,10 +113,10 @@ class World:
 
     def recv(self, timeout):
         end = self.time + timeout
-        while not self.answers and self.time < end:
+        while not self.answers:
+            if self.time >= end:
+                return None
             self.sleep(min(0.005, end - self.time))
-        if not self.answers:
-            return None
         can_id, data = self.answers.popleft()
         return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 

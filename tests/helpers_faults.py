@@ -2,18 +2,19 @@
 
 import struct
 from functools import partial, reduce
-from itertools import cycle, islice
+from itertools import cycle, islice, product
 from typing import NamedTuple
 
 import can
 import numpy as np
-from helpers_bus import ConstantCommand, HoldingOperator, World, once, only, raises
+from helpers_bus import ConstantCommand, HoldingOperator, World, only, raises
 
 from brokk_min.can.canopen import encoder_raw, valve_frame
 from brokk_min.machine import BROKK_170
 
 COMMAND = (60, 0, 60, 60, 60)
 STEP = BROKK_170.encoder_step[0]
+FOREIGN = range(0x300, 0x500)  # identifiers of no frame of ours
 
 
 def put(name, value):
@@ -28,8 +29,13 @@ def up(can_id, act):
 
 
 def valves(act):
-    """Change the first valve frame."""
-    return lambda world: put("downward", only(0x210, once(act)))(world)
+    """Change the next valve frame, and no other."""
+
+    def cause(world):
+        acts = iter([act])
+        world.downward = only(0x210, lambda data: next(acts, lambda data: [data])(data))
+
+    return cause
 
 
 def moved(add):
@@ -57,13 +63,10 @@ def delay(world, node, draw):
     world.noise = due
 
 
-def flood(world, foreign=False, rate=2000):
-    """Frames of each identifier and length, or of foreign identifiers alone; those that came."""
+def flood(world, ids=range(2048), rate=2000):
+    """Frames of each of the identifiers and each length; those that came."""
     rng = np.random.default_rng(0)
-    nodes = (1, 2, 3, 4, 5, 16)
-    known = {0, 0x80, 0x210, *(base + n for base in (0x180, 0x580, 0x600, 0x700) for n in nodes)}
-    ids = [i for i in range(2048) if not foreign or i not in known]
-    pairs = cycle(rng.permutation([(i, length) for i in ids for length in range(9)]).tolist())
+    pairs = cycle(rng.permutation(list(product(ids, range(9)))).tolist())
     begun, came = world.time, []
 
     def noise():
@@ -74,9 +77,6 @@ def flood(world, foreign=False, rate=2000):
 
     world.noise = noise
     return came
-
-
-foreign_flood = partial(flood, foreign=True)
 
 
 def foreign(world, can_id, data):
@@ -120,7 +120,7 @@ FAULTS = {
     "valve controller silent": (up(0x710, lambda d: []), "valve controller: heartbeat lost"),
     "valve controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
     "flood on all identifiers": (flood, ""),
-    "flood of 6,000 foreign frames a second": (partial(foreign_flood, rate=6e3), "bus flooded"),
+    "flood of 6,000 foreign frames a second": (partial(flood, ids=FOREIGN, rate=6e3), "flooded"),
     "foreign SYNC": (partial(foreign, can_id=0x080, data=b""), OTHER_SENDER),
     "foreign NMT": (partial(foreign, can_id=0x000, data=b"\x80\x10"), OTHER_SENDER),
     "foreign valve frame": (partial(foreign, can_id=0x210, data=THEIRS), OTHER_SENDER),
@@ -133,7 +133,7 @@ FAULTS = {
     "joystick raises": (put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
     "enable released": (put("operator.enable", False), ""),
     "SIGTERM": (lambda world: world.drive.signals.append(15), "stop asked for"),
-    "clock stepped forward": (put("offset", 3600.0), "tick late, or the"),
+    "clock stepped forward": (put("bus.start", 1.9e9), "tick late, or the"),
     "log cannot be written": (put("bus.flush", raises(OSError("full"))), "error (OSError: full)"),
     "late tick": (partial(stall, seconds=0.08), "tick late"),
     "policy returns NaN": (command(2, np.nan), "q3: no valid command"),
@@ -164,7 +164,7 @@ NOT_FOUND = {
     "q3 a tick late, without a gap": (partial(repeat_once, node=3), "no time, no number"),
     "slow q3 frozen": (partial(freeze, node=3, command=(15, 0, 15, 15, 15)), "it takes longer"),
     "q3 drifts by 60 counts/s": (partial(drift, node=3, speed=60), "it looks like motion"),
-    "4,500 foreign frames a second": (partial(foreign_flood, rate=4500), "harmless"),
+    "4,500 foreign frames a second": (partial(flood, ids=FOREIGN, rate=4500), "harmless"),
 }
 
 
@@ -189,6 +189,5 @@ def measure(cause, phase):
     words = world.drive.reason
     world.sleep(max(0.0, begun + 0.9 - world.time))
     times, m = world.commands
-    open_times = times[(times > begun) & m.any(axis=1)]
-    last = float(open_times[-1]) if len(open_times) else begun
+    last = max(times[m.any(axis=1)][-1], begun)
     return Outcome(last - begun, last < begun + 0.4, words)

@@ -24,12 +24,14 @@ from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
 SLOW = replace(BROKK_170, name="slow", rate=5.0)
-SLEW = replace(BROKK_170.joints[0], q_min=-3.1, q_max=3.1)
-SLIDE = replace(BROKK_170.joints[3], kind="prismatic", cylinder_base=0.0, encoder_step=2e-4)
-SLIDE = replace(BROKK_170, joints=(*BROKK_170.joints[:3], SLIDE, BROKK_170.joints[4]))
-WIDE = replace(BROKK_170, name="wide", joints=(SLEW, *BROKK_170.joints[1:]))
-SIXTH = replace(BROKK_170.joints[4], name="q6", encoder_node=6)
-SIX = replace(BROKK_170, name="six joints", joints=(*BROKK_170.joints, SIXTH), q_start=())
+SLEW, *OTHERS = BROKK_170.joints
+SLIDE = replace(SLEW, kind="prismatic", encoder_step=2e-4)
+SLIDE, WIDE = (
+    replace(BROKK_170, joints=(first, *OTHERS))
+    for first in (SLIDE, replace(SLEW, q_min=-3.1, q_max=3.1))
+)
+SIXTH = replace(SLEW, name="q6", encoder_node=6)
+SIX = replace(BROKK_170, joints=(*BROKK_170.joints, SIXTH), q_start=())
 
 
 def test_checksum__is_crc8_j1850():
@@ -115,7 +117,7 @@ def test_set_up_nodes__refuses_an_encoder_that_does_not_fit(upward, refusal):
         (SIX, "joints: expected at most 5 on a bus, got 6"),
         (replace(BROKK_170, valve_frame_id=0x583), "valve_frame_id: .* no other frame, got 0x583"),
         (SLOW, r"rate: expected 10 Hz or more \(watchdog\), got 5"),
-        (SLIDE, "q4: expected revolute, with a range below 6.18 rad, on a bus, got prismatic"),
+        (SLIDE, "q1: expected revolute, with a range below 6.18 rad, on a bus, got prismatic"),
         (WIDE, "q1: expected revolute, with a range below 6.18 rad, .* got revolute, 6.20"),
     ],
 )
@@ -150,7 +152,7 @@ def dictionary():
 
 def test_set_up_nodes__sets_up_an_encoder_of_the_canopen_library():
     """SDO, heartbeat, NMT and TPDO are the library's."""
-    machine = replace(BROKK_170, name="one joint", joints=BROKK_170.joints[:1], q_start=())
+    machine = replace(BROKK_170, joints=(SLEW,), q_start=())
     network, node = canopen.Network(), canopen.LocalNode(1, dictionary())
     network.connect(interface="virtual", channel="peers")
     try:

@@ -34,9 +34,8 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
     ):
         buses[1].send(can.Message(**({"is_extended_id": False} | fields)))
     frames = [bus.recv(0.5) for _ in range(6)]
-    assert [frame and frame.id for frame in frames] == [-1, 0x123, -1, -1, -1, -1]
-    assert frames[0] == Frame(bus.now(), -1, b"\x01\x02")
-    assert bus.recv(0.0) is None
+    assert [frame.id for frame in frames] == [-1, 0x123, -1, -1, -1, -1]
+    assert frames[0] == Frame(bus.now(), -1, b"\x01\x02") and bus.recv(0.0) is None
     bus.log_input(b"\x09")
     lines = text.getvalue().splitlines()
     assert len(lines) == 7

@@ -20,18 +20,15 @@ def test_script__waits_presses_plays_and_ends():
     assert script(False, True) == OperatorInput(enable=True)
     assert script(False, True) == OperatorInput()  # it did not arm: let go, and press again
     assert script(False, True) == OperatorInput(enable=True)
-    assert script(True, True) == OperatorInput((0.1, 0.0, 0.0), enable=True)
-    assert not script.done
-    assert script(True, True) == OperatorInput((0.0, 0.2, 0.0), enable=True)
-    assert script.done
+    assert script(True, True) == OperatorInput((0.1, 0.0, 0.0), enable=True) and not script.done
+    assert script(True, True) == OperatorInput((0.0, 0.2, 0.0), enable=True) and script.done
     assert script(True, True).stop
 
 
 def test_script__stops_after_a_fault_and_if_the_machine_never_gets_ready():
     script = Script(BROKK_170, TWO_GOALS)
     assert script(False, True).enable and script(True, True).enable
-    assert script(False, True) == OperatorInput(stop=True)
-    assert not script.done
+    assert script(False, True) == OperatorInput(stop=True) and not script.done
     script = Script(BROKK_170, TWO_GOALS)
     assert [script(False, False).stop for _ in range(101)] == [False] * 100 + [True]
 
@@ -49,15 +46,12 @@ def test_joystick__gives_switch_and_velocity_of_a_virtual_device():
     device.button(5, True)
     device.axis(1, -1.0)
     device.axis(0, 0.1)  # within the dead zone
-    found = stick(True, True)
-    assert found.enable
-    assert found.v_goal == pytest.approx((0.3, 0.0, 0.0), abs=1e-4)
+    assert stick(True, True).enable
+    assert stick(True, True).v_goal == pytest.approx((0.3, 0.0, 0.0), abs=1e-4)
     device.axis(0, 1.0)
     device.axis(4, -0.56)
-    x, y, z = stick(True, True).v_goal
-    assert np.linalg.norm((x, y, z)) == pytest.approx(0.3)  # no faster in a corner
-    assert x == pytest.approx(-y, rel=1e-3)
-    assert z / x == pytest.approx(0.275, abs=1e-3)
+    expected = 0.3 * np.array([1, -1, 0.275]) / np.linalg.norm([1, -1, 0.275])  # in a corner
+    assert stick(True, True).v_goal == pytest.approx(expected, abs=1e-4)
     device.button(5, False)
     assert not stick(True, True).enable
     device.unplug()

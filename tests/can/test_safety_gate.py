@@ -12,6 +12,8 @@ from brokk_min.machine import BROKK_170
 STEP = BROKK_170.encoder_step[0]
 DT = 0.05
 SHAPE = (3, 10, 100)  # of the gates
+RARE = {"stop": 0.03, "error": 0.03, "flooded": 0.02, "other_sender": 0.02}
+FLAGS = {"enable": 0.8, "centred": 0.7, "alive": 0.97} | RARE  # how often each input is set
 
 
 def tight_machine():
@@ -142,13 +144,7 @@ def draw_inputs(machine, rng):
         frames=put(rng, np.ones((*SHAPE, n), int), 0.01, 0, 2, 3),
         heartbeat=put(rng, beats, 0.01, -0.110, -0.110 - 1e-9, -np.inf, 0.049, 1.0, np.nan),
         nmt=put(rng, np.full((*SHAPE, n + 1), 5), 0.01, 0, 4, 6, 127),
-        enable=some(rng, 0.8),
-        centred=some(rng, 0.7),
-        alive=~some(rng, 0.03),
-        stop=some(rng, 0.03),
-        error=some(rng, 0.03),
-        flooded=some(rng, 0.02),
-        other_sender=some(rng, 0.02),
+        **{name: some(rng, p) for name, p in FLAGS.items()},
     )
 
 
