@@ -26,12 +26,12 @@ STEP = BROKK_170.encoder_step[0]
 SLOW = replace(BROKK_170, name="slow", rate=5.0)
 SLEW, *OTHERS = BROKK_170.joints
 SLIDE = replace(SLEW, kind="prismatic", encoder_step=2e-4)
-SLIDE, WIDE = (
-    replace(BROKK_170, joints=(first, *OTHERS))
-    for first in (SLIDE, replace(SLEW, q_min=-3.1, q_max=3.1))
-)
+WIDE = replace(SLEW, q_min=-3.1, q_max=3.1)
 SIXTH = replace(SLEW, name="q6", encoder_node=6)
-SIX = replace(BROKK_170, joints=(*BROKK_170.joints, SIXTH), q_start=())
+
+
+def brokk(*joints):
+    return replace(BROKK_170, joints=joints, q_start=())
 
 
 def test_checksum__is_crc8_j1850():
@@ -53,8 +53,7 @@ def test_valve_frame__by_hand():
 
 def test_encoder_counts__is_the_inverse_of_encoder_raw_however_mounted():
     mountings = zip(BROKK_170.joints, (100, 4000, -7, 2**26 - 1, 0), (1, -1, -1, 1, 1), strict=True)
-    joints = [replace(joint, encoder_zero=zero, encoder_sign=s) for joint, zero, s in mountings]
-    machine = replace(BROKK_170, joints=tuple(joints))
+    machine = brokk(*(replace(j, encoder_zero=z, encoder_sign=s) for j, z, s in mountings))
     assert encoder_counts(machine, [101, 3999, 2**26 - 9, 999, 3]).tolist() == [1, 1, 2, 1000, 3]
     q = np.linspace(machine.column("q_min"), machine.column("q_max"), 501)
     counts = np.rint(q / STEP).astype(int)
@@ -114,11 +113,14 @@ def test_set_up_nodes__refuses_an_encoder_that_does_not_fit(upward, refusal):
 @pytest.mark.parametrize(
     ("machine", "refusal"),
     [
-        (SIX, "joints: expected at most 5 on a bus, got 6"),
+        (brokk(SLEW, *OTHERS, SIXTH), "joints: expected at most 5 on a bus, got 6"),
         (replace(BROKK_170, valve_frame_id=0x583), "valve_frame_id: .* no other frame, got 0x583"),
         (SLOW, r"rate: expected 10 Hz or more \(watchdog\), got 5"),
-        (SLIDE, "q1: expected revolute, with a range below 6.18 rad, on a bus, got prismatic"),
-        (WIDE, "q1: expected revolute, with a range below 6.18 rad, .* got revolute, 6.20"),
+        (
+            brokk(SLIDE),
+            "q1: expected revolute, with a range below 6.18 rad, on a bus, got prismatic",
+        ),
+        (brokk(WIDE), "q1: expected revolute, with a range below 6.18 rad, .* got revolute, 6.20"),
     ],
 )
 def test_machines_that_do_not_fit_the_bus__are_refused_on_both_its_sides(machine, refusal):
@@ -152,17 +154,16 @@ def dictionary():
 
 def test_set_up_nodes__sets_up_an_encoder_of_the_canopen_library():
     """SDO, heartbeat, NMT and TPDO are the library's."""
-    machine = replace(BROKK_170, joints=(SLEW,), q_start=())
     network, node = canopen.Network(), canopen.LocalNode(1, dictionary())
     network.connect(interface="virtual", channel="peers")
     try:
         network.add_node(node)
         network.subscribe(0x080, lambda *_: network.send_message(0x181, node.get_data(0x6004, 0)))
         with open_bus("virtual", "peers") as bus:
-            set_up_nodes(bus, machine)
+            set_up_nodes(bus, brokk(SLEW))
             assert node.get_data(0x1017, 0) == b"\x32\x00" and node.get_data(0x1800, 2) == b"\x01"
             eventually(lambda: node.nmt.state == "OPERATIONAL")
-            nodes = Nodes(machine)
+            nodes = Nodes(brokk(SLEW))
             bus.send(0x080, b"")
             nodes.listen(bus, bus.now() + 0.3)
         assert nodes.raw.tolist() == [1234] and nodes.nmt.tolist() == [5, 0]

@@ -13,7 +13,6 @@ from brokk_min.can.drive_log import log_for_fit, read_frames, read_telemetry
 from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
-OTHER_FRAMES = ("12345678#", "123##F00", "123#R", "321#1122334455667788_B")
 
 
 def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):
@@ -26,7 +25,8 @@ def test_read_frames__reads_a_cut_log_up_to_its_last_whole_line(tmp_path):
 
 def test_read_frames__reads_what_candump_logs_and_what_it_prints_on_a_terminal(tmp_path):
     """Without extended, FD and remote frames, and those of a length code above eight."""
-    others = "".join(f"(2.0) can0 {frame}\n" for frame in OTHER_FRAMES)
+    frames = ("12345678#", "123##F00", "123#R", "321#1122334455667788_B")
+    others = "".join(f"(2.0) can0 {frame}\n" for frame in frames)
     (tmp_path / "can.log").write_text(f"(1.0) can0 123#0102\n{others}(3.0) can0 080# T\n")
     fd = " (2.000000)  can0  123  [12]  " + "00 " * 12 + "\n"
     printed = f" (1.000000)  can0  123   [2]  01 02\n{fd} (3.000000)  can0  080   [0]  \n"
@@ -44,12 +44,10 @@ def test_read_frames__reads_the_logs_of_other_tools(tmp_path, name):
             message = {"arbitration_id": can_id, "data": data, "is_extended_id": False}
             logger(can.Message(timestamp=time, is_rx=not sent, **message))
         logger(can.Message(timestamp=11.0, arbitration_id=0x123, is_extended_id=True))
-    found = list(read_frames(tmp_path / name))
-    assert [(frame.id, frame.data) for frame in found] == [(0x181, one.data) for one in frames]
-    times = np.array([frame.time for frame in found])
-    np.testing.assert_allclose(times - times[0], np.arange(20) / 20, atol=1e-3)
-    if name != "drive.trc":  # python-can writes all of its frames as received
-        assert [frame.sent for frame in found] == [one.sent for one in frames]
+    times, ids, data, sent = zip(*read_frames(tmp_path / name), strict=True)
+    assert set(ids) == {0x181} and list(data) == [frame.data for frame in frames]
+    np.testing.assert_allclose(np.array(times) - times[0], np.arange(20) / 20, atol=1e-3)
+    assert list(sent) == [frame.sent for frame in frames]
 
 
 def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
@@ -78,10 +76,9 @@ def test_log_for_fit__by_hand():
         counts = 100 * np.arange(1, 6) + np.array(ticks)[:, None]
         np.testing.assert_allclose(recording.q, counts * STEP, atol=1e-12)
         np.testing.assert_allclose(recording.u * 127, len(ticks) * [[80, 0, -80, 1, 0]], atol=1e-9)
-    q = [k for k, frame in enumerate(frames) if frame.id == 0x181]
-    unread = frames.copy()
-    for k in (0, 18):
-        unread[q[k]] = frames[q[k]]._replace(data=struct.pack("<I", 3000))
+    first, unread = [k for k, frame in enumerate(frames) if frame.id == 0x181], frames.copy()
+    for k in (first[0], first[18]):
+        unread[k] = frames[k]._replace(data=struct.pack("<I", 3000))
     (long,) = log_for_fit(machine, unread).recordings  # 16 after the second one, 14 before it
     np.testing.assert_allclose(long.q[:, 0], (np.arange(120, 136)) * STEP)
     refusal = r"15 ticks of driving in a row at 10 Hz \(--machine\), got 11 at most"

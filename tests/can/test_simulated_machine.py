@@ -10,7 +10,6 @@ from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame
 from brokk_min.can.simulated_machine import SimulatedMachine, start_pose
 from brokk_min.machine import BROKK_170
 
-NODES = [1, 2, 3, 4, 5, 16]
 CONTROLLER = 16
 
 
@@ -23,9 +22,6 @@ class Machine(SimulatedMachine):
     def take(self, can_id, data=b"", now=100.0):
         return self.receive(Frame(now, can_id, data))
 
-    def nmt_(self, command, node=0):
-        return self.take(0x000, bytes([command, node]))
-
     def valves(self, counter, *counts, enable=1, now=100.0, sync=True):
         """Send SYNC and a valve frame; the commands in force [counts]."""
         if sync:
@@ -37,7 +33,7 @@ class Machine(SimulatedMachine):
 
 def driving():
     machine = Machine()
-    machine.nmt_(1)
+    machine.take(0x000, b"\1\0")
     machine.valves(7)
     assert machine.valves(8, 80, 0, -40) == [80, 0, -40, 0, 0]
     return machine
@@ -48,8 +44,8 @@ def test_advance__moves_and_beats_by_its_own_clock():
     assert machine.next_step == pytest.approx(100.005)
     assert machine.advance(100.0 + 0.9 * HEARTBEAT_PERIOD) == []
     first = machine.advance(100.0 + HEARTBEAT_PERIOD + 1e-6)
-    assert first == [(0x700 + node, bytes([127])) for node in NODES]
-    machine.nmt_(1, NODES[1])
+    assert first == [(0x700 + node, bytes([127])) for node in (1, 2, 3, 4, 5, CONTROLLER)]
+    machine.take(0x000, b"\1\2")
     beats = machine.advance(100.0 + 3 * HEARTBEAT_PERIOD + 1e-6)
     assert beats == 2 * [first[0], (0x702, bytes([5])), *first[2:]]
     assert machine.steps == len(machine.plant.u) == 30 and not np.any(machine.plant.u)
@@ -60,13 +56,13 @@ def test_receive__opens_valves_after_a_start_and_a_neutral_frame():
     machine = Machine()
     neutral = [0, 0, 0, 0, 0]
     assert machine.valves(3) == machine.valves(4, 50) == neutral  # not started yet
-    machine.nmt_(1)
+    machine.take(0x000, b"\1\0")
     assert machine.valves(255, 50) == neutral and not machine.enabled  # no neutral frame came
     assert machine.valves(0) == neutral and machine.enabled  # 255, then 0
     assert machine.valves(1, 50, 0, 0, 0, -80) == [50, 0, 0, 0, -80]
     assert machine.valves(2, 50, enable=0) == machine.valves(3, 50) == neutral  # neutral first
     assert machine.valves(4) == neutral and any(machine.valves(5, 50))
-    machine.nmt_(1)  # to start what runs changes nothing
+    machine.take(0x000, b"\1\0")  # to start what runs changes nothing
     assert machine.u.any() and machine.valves(6, 30)[0] == 30
 
 
@@ -89,7 +85,7 @@ MALFORMED = "valve frame with a wrong length or checksum"
         (lambda m: m.take(0x210, FRAME[:7]), MALFORMED),
         (lambda m: m.valves(9, 77, sync=False), "second valve frame after a SYNC, counter 9"),
         (lambda m: m.take(0x080) + m.take(0x080), "no valve frame between two SYNCs"),
-        (lambda m: m.nmt_(2, CONTROLLER), None),
+        (lambda m: m.take(0x000, b"\2\x10"), None),
         (watchdog, "no valve frame for 0.15 s"),
     ],
     ids=["counter", "checksum", "short", "second", "missing", "stopped", "watchdog"],
@@ -98,10 +94,9 @@ def test_receive__closes_valves_until_a_start_and_a_neutral_frame(act, reason):
     machine = driving()
     act(machine)
     assert machine.reasons == [reason] * (reason is not None)
-    assert not machine.u.any() and not machine.enabled
-    assert machine.nmt[CONTROLLER] == 127
+    assert not (machine.u.any() or machine.enabled) and machine.nmt[CONTROLLER] == 127
     assert not any(machine.valves(77)) and not any(machine.valves(78, 80))  # nobody started it
-    machine.nmt_(1, CONTROLLER)
+    machine.take(0x000, b"\1\x10")
     assert not any(machine.valves(200, 80)) and not any(machine.valves(201))  # any counter begins
     assert any(machine.valves(202, 80))
 

@@ -24,8 +24,10 @@ def held(monkeypatch):
     return names
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def operator(monkeypatch):
+    """An operator at no display: SDL draws unseen."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setenv("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")  # unseen: never has the focus
     pygame.display.set_mode((10, 10))
     controller.quit()
@@ -82,14 +84,13 @@ def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch,
         return draw(machine, scene, size)
 
     monkeypatch.setattr(play, "draw", each_picture)
-    assert run("play") == 0
+    assert run("play") == 0 and not pygame.display.get_init()
     titles = [TITLES["rl"]] * 20 + [TITLES["jacobian_pid_k0.1"]] * 2
     assert [scene.title for scene in scenes] == titles
     assert scenes[19].v_tool[1] > 0.1 and scenes[19].u.any() and scenes[19].status == "1.0 s"
     fk = forward_kinematics(BROKK_170, np.array([scene.q for scene in scenes]))
     np.testing.assert_allclose(scenes[-1].trail, tool_position(fk))
     np.testing.assert_allclose([scene.v_goal for scene in scenes[-2:]], 2 * [[0, 0.3, 0]])
-    assert not pygame.display.get_init()
 
 
 def test_play__needs_a_display(monkeypatch):
