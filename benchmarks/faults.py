@@ -51,9 +51,9 @@ def table(repeats: int) -> None:
         for name, kinds in groups(faults).items():
             phases = (np.arange(repeats) + 0.5) / repeats * 0.05
             outcomes = [measure(kinds[k % len(kinds)][0], phases[k]) for k in range(repeats)]
-            latched = sum(bool(outcome.latched) for outcome in outcomes)
-            times = [1e3 * outcome.seconds for outcome in outcomes]
-            said = {re.sub(r"^(fault: )?(q\d: )?| \(.*", "", outcome.words) for outcome in outcomes}
+            times = [1e3 * seconds for seconds, _ in outcomes]
+            latched = int(np.isfinite(times).sum())
+            said = {re.sub(r"^(fault: )?(q\d: )?| \(.*", "", words) for _, words in outcomes}
             words = "; ".join(sorted(said - {""})) if faults is FAULTS else kinds[0][1]
             span = f"{np.median(times):.0f}, {max(times):.0f}" if latched else "not found"
             print(f"| {name} | {span} | {latched} of {repeats} | {words} |", flush=True)

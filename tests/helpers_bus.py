@@ -44,8 +44,8 @@ def random_policy(interface, machine=BROKK_170):
     sizes = [len(INTERFACES[interface].scale(machine)[0]), 64, 64, 64, len(machine.driven)]
     weights = []
     for inputs, outputs in pairwise(sizes):
-        weights.append((1.5 * rng.standard_normal((inputs, outputs)) / inputs**0.5).astype("f4"))
-        weights.append(np.zeros(outputs, np.float32))
+        weight = 1.5 * rng.standard_normal((inputs, outputs)) / inputs**0.5
+        weights += [weight.astype("f4"), np.zeros(outputs, "f4")]
     return Policy(machine, {}, tuple(weights), obedient_net(machine), interface)
 
 

@@ -3,7 +3,6 @@
 import struct
 from functools import partial, reduce
 from itertools import cycle, islice, product
-from typing import NamedTuple
 
 import can
 import numpy as np
@@ -168,16 +167,12 @@ NOT_FOUND = {
 }
 
 
-class Outcome(NamedTuple):
-    """What came of a fault, by the plant's own record."""
-
-    seconds: float  # from the fault until the valves were closed for good
-    latched: bool  # closed long before the end, though the operator held on
-    words: str  # reason that the program gave
-
-
 def measure(cause, phase):
-    """Drive for a second, let it go wrong `phase` [s] after a SYNC, and go on for 0.6 s."""
+    """Drive for a second, let it go wrong `phase` [s] after a SYNC, and go on for 0.6 s.
+
+    The time [s] until the valves were closed for good, by the plant's own record (inf: they were
+    open again or still 0.4 s later, while the operator holds on), and the program's reason.
+    """
     world = World(ConstantCommand(*COMMAND), HoldingOperator())
     world.drive.begin()
     world.run(1.0)
@@ -189,5 +184,5 @@ def measure(cause, phase):
     words = world.drive.reason
     world.sleep(max(0.0, begun + 0.9 - world.time))
     times, m = world.commands
-    last = max(times[m.any(axis=1)][-1], begun)
-    return Outcome(last - begun, last < begun + 0.4, words)
+    seconds = max(0.0, times[m.any(axis=1)][-1] - begun)
+    return seconds if seconds < 0.4 else np.inf, words

@@ -22,10 +22,7 @@ Q4 = 3
 
 
 class RemoteControl:
-    """The machine's own: SYNC each `period` [s], and valve frames with `command(tick)` after it.
-
-    Put it in the place of `World.noise`.
-    """
+    """The machine's own, as `World.noise`: SYNC each `period` [s], valve frames after it."""
 
     delay = 0.004  # s, of the valve frames
 

@@ -123,16 +123,15 @@ def test_tick__ends_neutral_and_latched_within_175_ms_of_every_fault(name):
     """
     phase = (0.0005, 0.0215, 0.0485)[list(FAULTS).index(name) % 3]
     cause, words = FAULTS[name]
-    outcome = measure(cause, phase)
-    assert outcome.latched, f"valves open {outcome.seconds:.3f} s later"
-    assert outcome.seconds < 0.175
-    assert words in outcome.words
+    seconds, found = measure(cause, phase)
+    assert seconds < 0.175
+    assert words in found
 
 
 @pytest.mark.parametrize("name", NOT_FOUND)
 def test_tick__cannot_find_what_the_documents_say_it_cannot(name):
     """Should one be found some day, the documents change."""
-    assert not measure(NOT_FOUND[name][0], 0.0215).latched
+    assert measure(NOT_FOUND[name][0], 0.0215)[0] == np.inf
 
 
 def closes_within(world, begun, seconds):
