@@ -154,9 +154,9 @@ def dictionary():
 
 def test_set_up_nodes__sets_up_an_encoder_of_the_canopen_library():
     """SDO, heartbeat, NMT and TPDO are the library's."""
-    network, node = canopen.Network(), canopen.LocalNode(1, dictionary())
-    network.connect(interface="virtual", channel="peers")
-    try:
+    node = canopen.LocalNode(1, dictionary())
+    with canopen.Network() as network:
+        network.connect(interface="virtual", channel="peers")
         network.add_node(node)
         network.subscribe(0x080, lambda *_: network.send_message(0x181, node.get_data(0x6004, 0)))
         with open_bus("virtual", "peers") as bus:
@@ -166,7 +166,5 @@ def test_set_up_nodes__sets_up_an_encoder_of_the_canopen_library():
             nodes = Nodes(brokk(SLEW))
             bus.send(0x080, b"")
             nodes.listen(bus, bus.now() + 0.3)
-        assert nodes.raw.tolist() == [1234] and nodes.nmt.tolist() == [5, 0]
-        assert np.isfinite(nodes.heartbeat).tolist() == [True, False]
-    finally:
-        network.disconnect()
+    assert nodes.raw.tolist() == [1234] and nodes.nmt.tolist() == [5, 0]
+    assert np.isfinite(nodes.heartbeat).tolist() == [True, False]

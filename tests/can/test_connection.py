@@ -2,6 +2,7 @@
 
 import io
 import re
+from functools import partial
 from types import SimpleNamespace
 
 import can
@@ -12,30 +13,24 @@ from brokk_min.can.canopen import Frame
 from brokk_min.can.connection import Bus, open_bus
 
 
-@pytest.fixture
-def buses():
-    here, there = (can.Bus("canopen", interface="virtual") for _ in range(2))
-    yield here, there
-    here.shutdown()
-    there.shutdown()
-
-
-def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes(buses):
-    text = io.StringIO()
-    bus = Bus(buses[0], "can0", text, echo=True, clock=lambda: 1.0)
-    bus.send(0x123, b"\x01\x02")
-    for fields in (
-        {"arbitration_id": 0x123, "data": b"\x01\x02"},  # the echo
-        {"arbitration_id": 0x123, "data": b"\x01\x02"},  # somebody else
-        {"arbitration_id": 0x123, "data": b"\x01", "is_extended_id": True},
-        {"arbitration_id": 0x124, "is_remote_frame": True},
-        {"arbitration_id": 0x125, "is_error_frame": True},
-        {"arbitration_id": 0x126, "is_fd": True, "data": bytes(12)},
-    ):
-        buses[1].send(can.Message(**({"is_extended_id": False} | fields)))
-    frames = [bus.recv(0.5) for _ in range(6)]
-    assert [frame.id for frame in frames] == [-1, 0x123, -1, -1, -1, -1]
-    assert frames[0] == Frame(bus.now(), -1, b"\x01\x02") and bus.recv(0.0) is None
+def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes():
+    text, virtual = io.StringIO(), partial(can.Bus, "echoes", interface="virtual")
+    with virtual() as here, virtual() as there:
+        bus = Bus(here, "can0", text, echo=True, clock=lambda: 1.0)
+        bus.send(0x123, b"\x01\x02")
+        for fields in (
+            {"data": b"\x01\x02"},  # the echo
+            {"data": b"\x01\x02"},  # somebody else
+            {"data": b"\x01", "is_extended_id": True},
+            {"is_remote_frame": True},
+            {"is_error_frame": True},
+            {"is_fd": True, "data": bytes(12)},
+        ):
+            plain = {"arbitration_id": 0x123, "is_extended_id": False}
+            there.send(can.Message(**(plain | fields)))
+        frames = [bus.recv(0.5) for _ in range(6)]
+        assert [frame.id for frame in frames] == [-1, 0x123, -1, -1, -1, -1]
+        assert frames[0] == Frame(bus.now(), -1, b"\x01\x02") and bus.recv(0.0) is None
     bus.log_input(b"\x09")
     lines = text.getvalue().splitlines()
     assert len(lines) == 7

@@ -16,22 +16,22 @@ RARE = {"stop": 0.03, "error": 0.03, "flooded": 0.02, "other_sender": 0.02}
 FLAGS = {"enable": 0.8, "centred": 0.7, "alive": 0.97} | RARE  # how often each input is set
 
 
+def edge(near, margin):
+    """A limit near `near` to which adding `margin` gives a whole number of counts."""
+    whole = (np.arange(3000) - 1500) * STEP
+    hits = [x - margin for x in whole.tolist() if x - margin + margin == x]
+    return min(hits, key=lambda x: abs(x - near))
+
+
 def tight_machine():
     """The Brokk with ranges such that whole counts hit the gate's borders, and a wide dead zone."""
-
-    def edge(near, margin):
-        """A limit near `near` to which adding `margin` gives a whole number of counts."""
-        whole = (np.arange(3000) - 1500) * STEP
-        hits = [x - margin for x in whole.tolist() if x - margin + margin == x]
-        return min(hits, key=lambda x: abs(x - near))
-
     margins = [(-0.05, 0.05), (-0.05, 0.05), (0.02, -0.02), (-0.05, -0.02), (0.02, 0.05)]
-    joints = tuple(
+    joints = [
         replace(j, q_min=edge(j.q_min, low), q_max=edge(j.q_max, high), cylinder_base=0.0)
         for j, (low, high) in zip(BROKK_170.joints, margins, strict=True)
-    )
-    wide = replace(joints[4], dead_zone=(0.07, 0.16))
-    return replace(BROKK_170, name="tight", joints=(*joints[:4], wide))
+    ]
+    joints[4] = replace(joints[4], dead_zone=(0.07, 0.16))
+    return replace(BROKK_170, name="tight", joints=tuple(joints))
 
 
 def plain_motion(machine, s, count, j):
