@@ -5,11 +5,12 @@ Tuning never sees what is scored: only `task_sequences` has the seed of the scor
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, brief, numbers, read_csv
@@ -49,10 +50,9 @@ class Commands(NamedTuple):
         Inward ones have x, y reversed where the tool starts at positive x, y, because otherwise
         the arm could follow them from one side of the slew range only.
         """
-        goals = np.repeat(self.goals[:, None], len(starts), axis=1)
-        sign = np.where(tool_position(forward_kinematics(machine, starts)) > 0, -1.0, 1.0)
-        sign[:, 2] = 1.0
-        return sign * goals if self.inward else goals
+        p = tool_position(forward_kinematics(machine, starts))
+        sign = np.where(self.inward & (p > 0), [-1.0, -1.0, 1.0], 1.0)
+        return np.asarray(sign * self.goals[:, None])
 
 
 def axis_sequences(machine: Machine) -> list[Commands]:
@@ -67,10 +67,12 @@ def task_sequences(machine: Machine) -> list[Commands]:
     """
     angle = np.linspace(0, 2 * np.pi, round(16 * machine.rate), endpoint=False)
     circle = [(machine.dt, 0.5 * np.cos(x), 0, 0.5 * np.sin(x)) for x in angle]
-    moves = {name: along(np.eye(3)[i]) for i, name in enumerate(AXES)}
+    ways = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}
+    ways |= {"diagonal_flat": [0.5**0.5, 0.5**0.5, 0]}
+    ways |= {"diagonal_rise": [3**-0.5, -(3**-0.5), 3**-0.5]}
+    seconds, speed = np.transpose(AXIS)
+    moves = {name: np.column_stack([seconds, np.outer(speed, way)]) for name, way in ways.items()}
     moves |= {
-        "diagonal_flat": along([0.5**0.5, 0.5**0.5, 0]),
-        "diagonal_rise": along([3**-0.5, -(3**-0.5), 3**-0.5]),
         "circle": np.array([REST, *circle, REST]),
         "rectangle": np.array(RECTANGLE),
         "stop_and_go": np.array(STOP_AND_GO),
@@ -86,12 +88,6 @@ def task_sequences(machine: Machine) -> list[Commands]:
     return result
 
 
-def along(direction: ArrayLike) -> Array:
-    """Rows of the pattern `AXIS` along a unit vector (3,)."""
-    seconds, speed = np.transpose(AXIS)
-    return np.column_stack([seconds, np.outer(speed, np.asarray(direction, float))])
-
-
 def _with_rests(rows: Array, rng: np.random.Generator) -> Array:
     """Rows with random seconds of each rest, such that all rows last `SECONDS`."""
     at_rest = ~rows[:, 1:].any(axis=1)
@@ -104,9 +100,9 @@ def _with_rests(rows: Array, rng: np.random.Generator) -> Array:
             return rows
 
 
-def _log_uniform(rng: np.random.Generator, shape: int | tuple[int, ...]) -> Array:
-    """Random lengths of rests [s]."""
-    return np.exp(rng.uniform(np.log(SHORTEST_REST), np.log(LONGEST_REST), shape))
+def _log_uniform(rng: np.random.Generator, num: int) -> Array:
+    """Random lengths of rests [s], (num,)."""
+    return np.exp(rng.uniform(np.log(SHORTEST_REST), np.log(LONGEST_REST), num))
 
 
 def read_commands(path: Path, machine: Machine) -> list[Commands]:
@@ -114,8 +110,8 @@ def read_commands(path: Path, machine: Machine) -> list[Commands]:
 
     The last row of a sequence is its end. ValueError: no such table, or rows below a tick apart.
     """
-    table = read_csv(path, "sequence", "time", "vx", "vy", "vz")
     names = ("time", "vx", "vy", "vz")
+    table = read_csv(path, "sequence", *names)
     columns = np.stack([numbers(path, name, table[name]) for name in names], axis=1)
     result = []
     for name in dict.fromkeys(table["sequence"].tolist()):
@@ -170,7 +166,7 @@ def draw_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed:
             poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
         return poses
 
-    return np.array(collected(machine, num, draw))
+    return np.array(first(machine, num, draw))
 
 
 def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
@@ -210,29 +206,25 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
     scored ones. ValueError: too few.
     """
     rng = np.random.default_rng(seed + 1000)
-    shape = POSES, int(np.ceil(seconds / TUNING.hold_min_s))  # of goals: enough for each pose
+    motions = POSES * int(np.ceil(seconds / TUNING.hold_min_s))  # enough for each pose
 
     def draw() -> Iterable[tuple[Array, Array]]:
-        poses = draw_pose(machine, rng, POSES)
-        v_goal = draw_goal(machine, TUNING, rng, shape[0] * shape[1]).reshape(*shape, 3)
-        rests = np.rint(_log_uniform(rng, shape) * machine.rate).astype(int)
-        holds = draw_hold(machine, TUNING, rng, shape[0] * shape[1]).reshape(shape)
-        ticks = np.where(v_goal.any(axis=-1), holds, rests)
-        runs = [np.repeat(*run, axis=0) for run in zip(v_goal, ticks, strict=True)]
-        goals = np.stack([run[: round(seconds * machine.rate)] for run in runs])
-        follows = feasible(machine, poses, goals.swapaxes(0, 1))
-        return zip(poses[follows], goals[follows], strict=True)
+        poses, v_goal = draw_pose(machine, rng, POSES), draw_goal(machine, TUNING, rng, motions)
+        rests = np.rint(_log_uniform(rng, motions) * machine.rate).astype(int)
+        ticks = np.where(v_goal.any(axis=1), draw_hold(machine, TUNING, rng, motions), rests)
+        runs = zip(np.split(v_goal, POSES), np.split(ticks, POSES), strict=True)
+        whole = [np.repeat(*run, axis=0)[: round(seconds * machine.rate)] for run in runs]
+        follows = feasible(machine, poses, np.stack(whole, axis=1))
+        return zip(poses[follows], np.array(whole)[follows], strict=True)
 
-    starts, goals = zip(*collected(machine, num, draw), strict=True)
+    starts, goals = zip(*first(machine, num, draw), strict=True)
     return np.array(starts), np.stack(goals, axis=1)
 
 
-def collected(machine: Machine, num: int, draw: Callable[[], Iterable[Any]]) -> list[Any]:
+def first(machine: Machine, num: int, draw: Callable[[], Iterable[Any]]) -> list[Any]:
     """The first `num` of what is drawn again and again; ValueError: too few."""
-    found: list[Any] = []
-    for _ in tqdm(range(DRAWS), "draw starts", leave=False, disable=None):
-        found.extend(draw())
-        if len(found) >= num:
-            return found[:num]
+    draws = chain.from_iterable(draw() for _ in range(DRAWS))
+    found = list(tqdm(islice(draws, num), "draw starts", num, leave=False, disable=None))
     wanted = "from which the arm stays on its path, above the ground and within ranges and speeds"
-    raise ValueError(f"{machine.name}: expected {num} starts {wanted}, got {len(found)}")
+    require(len(found) == num, machine.name, f"{num} starts {wanted}", len(found))
+    return found
