@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from brokk_min._files import expect_same, expected, read_json, write_json
@@ -54,7 +55,7 @@ def baselines(
     gains = gains or first_gains(machine)
     feedforward = static_map(machine, select_nets(machine, net))
     return {
-        RAW: JacobianController(with_dead_zone(machine, 0), gains[RAW], 0.1, w0),
+        RAW: JacobianController(with_pairs(machine, "dead_zone", 0), gains[RAW], 0.1, w0),
         BY_HAND: JacobianController(machine, gains[BY_HAND], 0.1, w0),
         OPTIMISED: JacobianController(machine, gains[OPTIMISED], 0.1, w0),
         PAPER_BASELINES[1]: JacobianController(machine, gains[OPTIMISED], 0.05, w0),
@@ -69,17 +70,17 @@ def first_gains(machine: Machine, plant: Plant = PLANT) -> dict[str, Any]:
     few = {"kp": 0.2 * n, "ki": 0.5 * n, "kd": 0.02 * n, "feedback": 0.1 * one}
     few |= {"min_opening": 0.015 * one, "integral_feedback": 1.0 * one}
     return {
-        RAW: gains_by_hand(machine, with_dead_zone(machine, 0), plant),
+        RAW: gains_by_hand(machine, with_pairs(machine, "dead_zone", 0), plant),
         BY_HAND: pid,
         OPTIMISED: replace(pid, kd=0.05 * n),
         STRONGEST: StrongGains(**few, start_boost=2.0 * one, start_time=0.26 * one),
     }
 
 
-def with_dead_zone(machine: Machine, zone: float) -> Machine:
-    """The machine with one dead zone for all joints, both ways."""
-    joints = tuple(replace(joint, dead_zone=(zone, zone)) for joint in machine.joints)
-    return replace(machine, joints=joints)
+def with_pairs(machine: Machine, field: str, pairs: ArrayLike) -> Machine:
+    """The machine with other numbers up and down of one field of its joints, as of (n, 2)."""
+    rows = zip(machine.joints, np.broadcast_to(pairs, (machine.n, 2)).tolist(), strict=True)
+    return replace(machine, joints=tuple(replace(j, **{field: tuple(p)}) for j, p in rows))
 
 
 @dataclass(frozen=True)
@@ -132,25 +133,16 @@ def last_before_overshoot(
     return max(0, int(np.argmax([*too_much, True])) - 1)
 
 
-def gains_of(like: Gains, vector: Array) -> Any:
-    """Gains of the kind of `like` from a vector (..., size) of all of them in their order."""
-    sizes = [array.shape[-1] for array in vars(like).values()]
-    return type(like)(*np.split(vector, np.cumsum(sizes)[:-1], axis=-1))
-
-
 def tuning_cost(
-    controller: JacobianController,
-    runs: tuple[Array, Array],
-    seed: int,
-    plant: Plant,
-    vectors: Array,
+    controller: JacobianController, runs: tuple[Array, Array], seed: int, plant: Plant, gains: Gains
 ) -> Array:
-    """Mean |v_goal - v_tool| [m/s] with each row of gains, `vectors` (rows, size): (rows,).
+    """Mean |v_goal - v_tool| [m/s] with each row of gains (rows, ...): (rows,).
 
     `runs` are starts [rad] (num, n) and goals [m/s] (T, num, 3) of `tuning_set`.
     """
-    rows, num = len(vectors), len(runs[0])
-    batch = replace(controller, gains=gains_of(controller.gains, np.repeat(vectors, num, axis=0)))
+    rows, num = len(gains.kp), len(runs[0])
+    repeated = {name: np.repeat(array, num, axis=0) for name, array in vars(gains).items()}
+    batch = replace(controller, gains=replace(gains, **repeated))
     start, goals = np.tile(runs[0], (rows, 1)), np.tile(runs[1], (1, rows, 1))
     rng = np.random.default_rng(seed)
     trace = rollout(controller.machine, batch, start, goals, TaskConfig.noise, rng, plant)
@@ -158,33 +150,37 @@ def tuning_cost(
     return np.asarray(error.mean(axis=0).reshape(rows, num).mean(axis=1))
 
 
-def tune(gains: Gains, cost: Callable[[Array], Array], seed: int, generations: int) -> Array:
-    """The vector of gains of least `cost`, which is that (rows,) of rows of gains.
+def tune(gains: Gains, cost: Callable[[Any], Array], seed: int, generations: int) -> Any:
+    """Gains of the kind of `gains` of least `cost`, which is that (rows,) of rows of gains.
 
     SciPy's differential evolution over x in gain = low + x^2 (high - low), so that small gains of a
     wide range are searched as finely as large ones. The first candidates are near `gains`.
     """
     from scipy.optimize import Bounds, differential_evolution  # slow to import
 
-    sizes = [array.shape[-1] for array in vars(gains).values()]
+    sizes = [array.size for array in vars(gains).values()]
     low, high = np.repeat([RANGES[name] for name in vars(gains)], sizes, axis=0).T
-    vector = np.concatenate(list(vars(gains).values()))
-    start = np.sqrt(np.clip((vector - low) / (high - low), 0, 1))
+    start = np.sqrt(np.clip((np.concatenate([*vars(gains).values()]) - low) / (high - low), 0, 1))
     rng = np.random.default_rng(seed)
-    first = np.clip(rng.normal(start, SPREAD, (CANDIDATES, len(start))), 0, 1)
-    first[0] = start
+    candidates = np.clip(rng.normal(start, SPREAD, (CANDIDATES, len(start))), 0, 1)
+    candidates[0] = start
+
+    def gains_of(x: Array) -> Any:
+        rows = low + x.T**2 * (high - low)
+        return type(gains)(*np.split(rows, np.cumsum(sizes)[:-1], axis=-1))
+
     with tqdm(total=generations + 1, desc="tune", unit="generation", disable=None) as bar:
 
         def objective(x: Any) -> Any:
             bar.update()
-            return cost(low + x.T**2 * (high - low))
+            return cost(gains_of(x))
 
         result = differential_evolution(
-            objective, Bounds(0 * start, 0 * start + 1), init=first, rng=seed,
+            objective, Bounds(0 * start, 0 * start + 1), init=candidates, rng=seed,
             maxiter=generations, mutation=(0.4, 0.9), tol=0, polish=False,
             vectorized=True, updating="deferred",
         )  # fmt: skip
-    return np.asarray(low + result.x**2 * (high - low))
+    return gains_of(result.x)
 
 
 def tuned_baselines(
@@ -200,7 +196,7 @@ def tuned_baselines(
     first = baselines(machine, net, gains)
     for name, factor in TUNED.items():
         cost = partial(tuning_cost, first[name], runs, seed, plant)
-        gains[name] = gains_of(gains[name], tune(gains[name], cost, seed, factor * generations))
+        gains[name] = tune(gains[name], cost, seed, factor * generations)
     return baselines(machine, net, gains)
 
 

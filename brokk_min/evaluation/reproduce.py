@@ -85,26 +85,24 @@ def fit_net(chain: Chain, name: str, log: logs.Log, recipe: Mapping[str, Any]) -
 def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     """One of `POLICIES`, by its own recipe."""
     recipe = find_recipe(paper=name != "rl", critic=name == "rl_critic")
-    if chain.budget.train_steps:
-        learner = replace(recipe.learner, total_steps=chain.budget.train_steps)
-        recipe = replace(recipe, learner=learner)
-    driven = select_nets(chain.machine, net)
-    seed = chain.seed + MEDIAN_SEEDS[name]
+    steps = chain.budget.train_steps or recipe.learner.total_steps
+    recipe = replace(recipe, learner=replace(recipe.learner, total_steps=steps))
+    driven, seed = select_nets(chain.machine, net), chain.seed + MEDIAN_SEEDS[name]
     return train_policy(chain.machine, driven, recipe, seed, chain.out / POLICIES[name])
 
 
 def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
     """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names."""
+    tune = partial(baselines.tuned_baselines, chain.machine)
     jobs: dict[str, Callable[..., Any]] = {
         "net": partial(fit_net, chain, "net", log, {}),
         "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
+        "rl_paper": partial(train, chain, "rl_paper"),  # the longest first
+        "rl_critic": partial(train, chain, "rl_critic"),
+        "rl": partial(train, chain, "rl"),
+        "pids": partial(tune, effort=chain.budget.tuning, seed=chain.seed),
     }
-    needs = {"pids": ["net"]}
-    for name in sorted(POLICIES, reverse=True):  # the longest first
-        jobs[name] = partial(train, chain, name)
-        needs[name] = ["net_paper" if name == "rl_critic" else "net"]  # as printed on as printed
-    tuned = partial(baselines.tuned_baselines, chain.machine)
-    jobs["pids"] = partial(tuned, effort=chain.budget.tuning, seed=chain.seed)
+    needs = {"rl_paper": ["net"], "rl_critic": ["net_paper"], "rl": ["net"], "pids": ["net"]}
     return side_by_side(jobs, needs)
 
 
@@ -133,23 +131,17 @@ def measure(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], repo
     return results, (tests, gap, traces)
 
 
-def scale_valves(machine: Machine, up: float, down: float) -> Machine:
-    """The machine with other cylinder speeds up and down."""
-    speeds = machine.cylinder_speeds * [up, down]
-    pairs = zip(machine.joints, speeds.tolist(), strict=True)
-    return replace(machine, joints=tuple(replace(j, cylinder_speed=tuple(s)) for j, s in pairs))
-
-
 def variations(machine: Machine) -> dict[str, Machine]:
     """Machines unknown to the controllers, by name; all numbers assumed."""
+    speeds, change = machine.cylinder_speeds, partial(baselines.with_pairs, machine)
     return {
         "nominal": machine,
         "supply flow -70 %": replace(machine, pump_flow=0.3 * machine.pump_flow),
-        "valve gain -20 %": scale_valves(machine, 0.8, 0.8),
-        "valve gain +20 %": scale_valves(machine, 1.2, 1.2),
-        "up -15 %, down +15 %": scale_valves(machine, 0.85, 1.15),
-        "dead zone 5 %": baselines.with_dead_zone(machine, 0.05),
-        "dead zone 10 %": baselines.with_dead_zone(machine, 0.10),
+        "valve gain -20 %": change("cylinder_speed", speeds * 0.8),
+        "valve gain +20 %": change("cylinder_speed", speeds * 1.2),
+        "up -15 %, down +15 %": change("cylinder_speed", speeds * [0.85, 1.15]),
+        "dead zone 5 %": change("dead_zone", 0.05),
+        "dead zone 10 %": change("dead_zone", 0.10),
         "delay +50 ms": replace(machine, delay=machine.delay + 0.050),
     }
 
