@@ -83,8 +83,7 @@ def evaluate(
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     `starts` are angles [rad] (starts, n). The sensors have the noise of training. Returns one row
-    per controller, sequence and start, see `metrics`; and traces. The kind of the starts is
-    "workspace", because the machine's own sequences are feasible from them.
+    per controller, sequence and start, see `metrics`; and traces.
     """
     p_start = tool_position(forward_kinematics(machine, starts))
     goals = {s.name: s.for_starts(machine, starts) for s in sequences}  # all are one batch
@@ -140,13 +139,14 @@ def mean_interval(values: Array) -> Mean:
 
 
 def interval_text(number: Mean) -> str:
-    """A mean with its interval, if it has one.
+    """A mean with its interval, if it was measured and has one.
 
     Example:
         >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
         '0.0123 (-0.5000 to 41.27)'
     """
     texts = [f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in number.values() if x is not None]
+    texts = texts or ["not measured"]
     return texts[0] if len(set(texts)) == 1 else "{} ({} to {})".format(*texts)
 
 

@@ -24,40 +24,33 @@ from brokk_min.machine import BROKK_170
 )
 def test_line_distance__by_hand(goals, p_tool, expected):
     """A stop and the way back keep a line, a turn begins another; before, it is the start."""
-    result = m.line_distance(np.array(p_tool)[:, None], np.array(goals)[:, None], np.zeros((1, 3)))
-    assert result[:, 0] == pytest.approx(expected)
+    p, v = (np.stack([rows, np.zeros_like(rows)], axis=1, dtype=float) for rows in (p_tool, goals))
+    result = m.line_distance(p, v, np.zeros((2, 3)))  # the second run rests meanwhile
+    assert result[:, 0] == pytest.approx(expected) and not result[:, 1].any()
 
 
 def test_metrics__by_hand():
-    v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])
-    u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5]])
-    q, p_tool, rewards = np.zeros((3, 5)), np.cumsum(v, axis=0) * 0.05, 1 / np.arange(1, 4)
-    trace = Trace(*(a[:, None] for a in (q, q, u, p_tool, v, rewards)))
-    goals = np.tile([0.1, 0.0, 0.0], (3, 1, 1))
-    row = m.metrics(BROKK_170, trace, goals, np.zeros((1, 3)))
-    assert row["velocity_error_mean"] == pytest.approx((0.1 + 0.0 + 0.2) / 3)
-    assert row["velocity_rmse"] == pytest.approx(np.sqrt((0.01 + 0.04) / 3))
-    assert row["valve_travel"] == pytest.approx(0.5 + 0.2 + 1.0)  # from rest, then tick by tick
-    assert row["jerk_rms"] == pytest.approx(0.1 * 400)  # second difference 0.1 m/s at 20 Hz
-    assert row["reward_mean"] == pytest.approx((1 + 1 / 2 + 1 / 3) / 3)
-    assert row["off_axis_drift_max"] == pytest.approx(0.0)
-
-
-def test_metrics__of_a_batch_are_those_of_its_runs():
-    rng = np.random.default_rng(0)
-    goals = np.repeat(rng.integers(-1, 2, (3, 4, 3)) * 0.1, 10, axis=0)
-    goals[:10, 0] = 0.0  # one rests while the others move
-    start = rng.normal(size=(4, 3))
-    arrays = [rng.normal(0, 0.1, (30, 4, size)) for size in (5, 5, 5, 3, 3)]
-    trace = Trace(*arrays, rng.random((30, 4)))
-    batch = m.metrics(BROKK_170, trace, goals, start)
-    for i in range(4):
-        run = slice(i, i + 1)
-        of_run = Trace(*(array[:, run] for array in trace))
-        for name, value in m.metrics(BROKK_170, of_run, goals[:, run], start[run]).items():
-            np.testing.assert_allclose(batch[name][run], value, err_msg=name)
-    jerk = np.diff(trace.v_tool, n=2, axis=0) * 400
-    np.testing.assert_allclose(batch["jerk_rms"] ** 2, (jerk**2).sum(axis=(0, 2)) / 28)
+    """Of a run, and of another one beside it that stands still without a goal."""
+    v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0], [0.3, 0, 0]])
+    u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5], [0.2, -0.5]])
+    p = np.outer([0.0, 0.1, 0.3, 0.0], [0, 1, 0])
+    goals, rewards = np.tile([0.1, 0.0, 0.0], (4, 1)), 1 / np.arange(1, 5)
+    arrays = (np.zeros((4, 5)), np.zeros((4, 5)), u, p, v, rewards)
+    trace = Trace(*(np.stack([array, 0 * array], axis=1) for array in arrays))
+    goals = np.stack([goals, 0 * goals], axis=1)
+    rows = m.metrics(BROKK_170, trace, goals, np.zeros((2, 3)))
+    expected = {
+        "velocity_error_mean": (0.1 + 0.0 + 0.2 + 0.2) / 4,
+        "velocity_rmse": np.sqrt((0.01 + 0.04 + 0.04) / 4),
+        "valve_travel": 0.5 + 0.2 + 1.0,  # from rest, then tick by tick
+        "jerk_rms": np.sqrt((0.1**2 + 0.2**2) / 2) * 400,  # second differences at 20 Hz
+        "reward_mean": (1 + 1 / 2 + 1 / 3 + 1 / 4) / 4,
+        "off_axis_drift_max": 0.3,
+        "off_axis_drift_mean": 0.1,
+    }
+    assert rows.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_allclose(rows[name], [value, 0], atol=1e-12, err_msg=name)
 
 
 STARTS = np.array([BROKK_170.q_start, [1.0, 0.5, 0.9, 1.5, 1.0]])
@@ -86,10 +79,11 @@ def test_evaluate__gives_rows_in_order_with_their_figures():
     assert pid < idle
 
 
-def test_mean_interval__of_one_value_or_equal_ones():
+def test_mean_interval__of_one_value_or_equal_ones_or_none():
     one = m.mean_interval(np.array([1.0]))
     assert one == {"mean": 1.0, "low": None, "high": None} and m.interval_text(one) == "1"
     assert m.interval_text({"mean": 0.5, "low": 0.5, "high": 0.5}) == "0.5000"
+    assert m.interval_text(dict.fromkeys(one)) == "not measured"
 
 
 def test_means__are_over_starts_of_the_means_of_their_runs():
