@@ -1,13 +1,10 @@
-"""The report: the paper's figures, and one HTML page with them, `report.html.j2`.
-
-Controllers differ in colour and in dashes, so that the colour-blind tell them apart, too.
-"""
+"""The report: the paper's figures, and one HTML page with them, `report.html.j2`."""
 
 import base64
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jinja2 import StrictUndefined, Template
@@ -27,13 +24,14 @@ from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170, Array, Machine
 
 Results = Mapping[str, Any]  # of `results.json`
+Row = tuple[Sequence[str], Mapping[str, Array]]  # of plots: labels, and curves (T, labels) by name
 Measured = tuple[Mapping[str, Tests], Motion, Traces]  # of machine and nets, nets less machine
 ROWS = (BY_HAND, OPTIMISED, "rl_paper", "rl", STRONGEST)
 PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
 SAMPLE = ("rl_paper", "rl_critic", BY_HAND, OPTIMISED)  # drawn in Fig. 6
 BOUND = 0.0097  # m/s, of `benchmarks/perfect_model.py`, which knows the plant of the Brokk 170
 WIDTH = 10.0  # inch, of every figure, so that letters have one size in the report
-LINES = ("-", "--", "-.", ":")
+LINES = ("-", "--", "-.", ":")  # beside colours, for the colour-blind
 
 
 @style.context("default")  # not the settings of the owner for his own pictures
@@ -91,14 +89,11 @@ def draw(ax: Axes, curves: Curves, xlabel: str, ylabel: str, title: str = "") ->
     ax.grid(alpha=0.3)
 
 
-def plot_over_time(
-    dt: float,
-    rows: Sequence[tuple[Sequence[str], Mapping[str, Array]]],
-    sharey: Literal["none", "row"] = "none",
-) -> Figure:
-    """Rows of plots, one for each of the row's labels: columns of its curves (T, labels)."""
+def plot_over_time(dt: float, rows: Sequence[Row], share: bool = True) -> Figure:
+    """Rows of plots over time, which `share` their scale, one for each of the row's labels."""
     figure = Figure((WIDTH, 2.6 * len(rows) + 0.3), layout="constrained")
-    axes = figure.subplots(len(rows), len(rows[0][0]), squeeze=False, sharey=sharey)
+    shape = len(rows), len(rows[0][0])
+    axes = figure.subplots(*shape, squeeze=False, sharey="row" if share else "none")
     for row, (labels, curves) in zip(axes, rows, strict=True):
         for i, label in enumerate(labels):
             columns = {name: (dt * np.arange(1, len(y) + 1), y[:, i]) for name, y in curves.items()}
@@ -109,15 +104,13 @@ def plot_over_time(
 
 def plot_tests(machine: Machine, both: Mapping[str, Tests]) -> Figure:
     """Range and direction, coupling, and past movement; machine above nets. Paper: Fig. 2"""
-    name = machine.names[machine.driven[-1]]
-    angle, velocity = f"{name} [rad]", f"velocity {name} [rad/s]"
-    time = "time after the step [s]"
+    joint = machine.names[machine.driven[-1]]
     figure = Figure((WIDTH, 5.5), layout="constrained")
     axes = figure.subplots(2, 3, sharey="col")
     for row, (kind, tests) in zip(axes, both.items(), strict=True):
         for ax, (test, curves) in zip(row, tests.items(), strict=True):
-            xlabel = time if test == "past movement" else angle
-            draw(ax, curves, xlabel, velocity, f"{kind}: {test}")
+            xlabel = "time after the step [s]" if test == "past movement" else f"{joint} [rad]"
+            draw(ax, curves, xlabel, f"velocity {joint} [rad/s]", f"{kind}: {test}")
             ax.legend(fontsize="small")
     return figure
 
@@ -131,7 +124,7 @@ def plot_gap(machine: Machine, gap: Motion) -> Figure:
         values = np.stack([velocity, 1000 * position], axis=1)  # (T, 2, runs)
         curves = {"median of all runs": np.median(values, axis=-1), "first run": values[..., 0]}
         rows.append(([f"{name} [{unit}/s]", f"{name} [m{unit}]"], curves))
-    return plot_over_time(machine.dt, rows)
+    return plot_over_time(machine.dt, rows, share=False)
 
 
 def plot_errors(errors: Mapping[str, Mean]) -> Figure:
@@ -173,11 +166,11 @@ def plot_sequence(machine: Machine, traces: Traces, sequence: Commands, starts: 
         positions[name], velocities[name] = trace.p_tool[:, 0] - p_start, trace.v_tool[:, 0]
     above = [f"{axis} - {axis}(0) [m]" for axis in AXES], positions
     below = [f"velocity {axis} [m/s]" for axis in AXES], velocities
-    return plot_over_time(machine.dt, [above, below], sharey="row")
+    return plot_over_time(machine.dt, [above, below])
 
 
 def plot_joint_velocities(machine: Machine, traces: Traces, sequence: str) -> Figure:
     """Velocity of the driven joints of `SAMPLE` from the first start. Paper: Fig. 6d"""
     labels = [f"velocity {machine.names[i]} [rad/s]" for i in machine.driven]
     curves = {name: traces[name, sequence].q_dot[:, 0, machine.driven] for name in SAMPLE}
-    return plot_over_time(machine.dt, [(labels, curves)], sharey="row")
+    return plot_over_time(machine.dt, [(labels, curves)])
