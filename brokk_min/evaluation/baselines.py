@@ -79,8 +79,9 @@ def first_gains(machine: Machine, plant: Plant = PLANT) -> dict[str, Any]:
 
 def with_pairs(machine: Machine, field: str, pairs: ArrayLike) -> Machine:
     """The machine with other numbers up and down of one field of its joints, as of (n, 2)."""
-    rows = zip(machine.joints, np.broadcast_to(pairs, (machine.n, 2)).tolist(), strict=True)
-    return replace(machine, joints=tuple(replace(j, **{field: tuple(p)}) for j, p in rows))
+    every: Any = map(tuple, np.broadcast_to(pairs, (machine.n, 2)).tolist())
+    rows = zip(machine.joints, every, strict=True)
+    return replace(machine, joints=tuple(replace(joint, **{field: pair}) for joint, pair in rows))
 
 
 @dataclass(frozen=True)

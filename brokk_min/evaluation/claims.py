@@ -25,10 +25,9 @@ SHORT = {ERROR: "error", DRIFT: "drift"}  # in columns
 
 
 def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any]:
-    """A sentence of `claims.toml` with its verdicts, as in `results.json`.
+    """A sentence of `claims.toml` with its verdicts, by what is judged, as in `results.json`.
 
-    `numbers` are by what is judged and by what they are of. The sentence holds where all of them,
-    with their intervals, are beyond its limit.
+    It holds where all `numbers` of what is judged are beyond its limit, with their intervals.
     """
     text = TEXTS[name]
     side, end = ("above", "low") if "above" in text else ("below", "high")
@@ -45,10 +44,9 @@ def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any
 
 
 def net_claims(nets: Tests, gap: Motion) -> list[dict[str, Any]]:
-    """Do the nets behave as the paper's machine?
+    """Do the nets behave as the paper's machine? Single tests, so numbers without an interval.
 
-    The plant was made after the paper's figures, so verdicts on it could not fail. These are single
-    tests, so they have no interval. Paper: Sec. 3.2 and 4.1, Fig. 2 and 5
+    Paper: Sec. 3.2 and 4.1, Fig. 2 and 5
     """
     _, up, down, _ = (np.abs(q_dot).max() for _, q_dot in nets["range and direction"].values())
     idle, moving = (response_time(*curve) for curve in nets["past movement"].values())
@@ -72,8 +70,7 @@ def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
     def drift(names: Sequence[str]) -> dict[str, dict[str, Mean]]:
         """Of each controller, along x."""
-        drifts = {name: by_start(runs, name, "x", DRIFT) for name in names}
-        return {TITLES[name]: {"drift": mean_interval(of)} for name, of in drifts.items()}
+        return {TITLES[c]: {"drift": mean_interval(by_start(runs, c, "x", DRIFT))} for c in names}
 
     def less(sequences: Sequence[str], keys: Sequence[str] = (ERROR,)) -> dict[str, Any]:
         """Figures of each policy less those of each PID: negative where the policy is better."""

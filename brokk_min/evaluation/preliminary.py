@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brokk_min.actuator import PLANT, ActuatorNet, Plant
+from brokk_min.actuator import Plant
 from brokk_min.identification.excitation import task_log
-from brokk_min.identification.net_file import select_nets
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import PWM_MAX, Array, Machine, encode_pwm
 
@@ -33,13 +32,6 @@ class Motion(NamedTuple):
     v_tool: Array  # m/s
 
 
-def run(machine: Machine, net: ActuatorNet, seed: int) -> tuple[dict[str, Tests], Motion]:
-    """Tests of the machine and of its nets, and nets less machine. Paper: Sec. 3.2 and 4.1"""
-    both: dict[str, Plant] = {"machine": PLANT, "nets": select_nets(machine, net)}
-    tests = {name: preliminary_tests(machine, plant) for name, plant in both.items()}
-    return tests, sim_to_real(machine, both, seed)
-
-
 def simulate(machine: Machine, plant: Plant, q: Array, u: Array) -> Array:
     """True angles [rad] (T + 1, ..., n) from rest at `q` under commands `u` (T, ..., n)."""
     state = plant.reset(machine, q)
@@ -57,8 +49,7 @@ def preliminary_tests(machine: Machine, plant: Plant) -> Tests:
     angles [rad] are by PWM byte, and at the limit alone or with others. Paper: Sec. 3.2, Fig. 2
     """
     joint, others = machine.driven[-1], machine.driven[:-1]
-    limit = machine.pwm_limit / PWM_MAX
-    slow = round(SLOW * machine.pwm_limit) / PWM_MAX
+    slow, limit = np.array([round(SLOW * machine.pwm_limit), machine.pwm_limit]) / PWM_MAX
     u = np.zeros((5, machine.n))
     u[:, joint] = [slow, limit, -limit, -slow, limit]
     u[4, others] = -limit

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min._files import write_csv, write_json
-from brokk_min.actuator import ActuatorNet
+from brokk_min.actuator import PLANT, ActuatorNet, Plant
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.identification import fitting, logs
 from brokk_min.identification.excitation import collect
@@ -116,7 +116,9 @@ def measure(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], repo
     write_csv(chain.out / "starts.csv", machine.names, starts.tolist())
     ticks = round(budget.short_s * machine.rate)
     short = [axis._replace(goals=axis.goals[:ticks]) for axis in commands[:3]]
-    tests, gap = preliminary.run(machine, net, seed)
+    plants: dict[str, Plant] = {"machine": PLANT, "nets": net}
+    tests = {kind: preliminary.preliminary_tests(machine, of) for kind, of in plants.items()}
+    gap = preliminary.sim_to_real(machine, plants, seed)
     runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
     along = metrics.means([run for run in runs if run["sequence"] in sequences.AXES])
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, net)

@@ -30,6 +30,8 @@ TUNING = TaskConfig(zero_goals=0.3, hold_min_s=0.5, hold_max_s=3.0)  # assumed
 # Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
 AXIS = ((1, 0), (4, 2 / 3), (1, 0), (4, -2 / 3), (1, 0), (3, 1 / 3), (3, -1 / 3), (1, 0))
+WAYS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+WAYS |= {"diagonal_flat": (0.5**0.5, 0.5**0.5, 0), "diagonal_rise": (3**-0.5, -(3**-0.5), 3**-0.5)}
 # Along x, y and z:
 REST = (1, 0, 0, 0)
 RECTANGLE = (REST, (5, 0, 0.5, 0), (3, 0, 0, 0.5), (5, 0, -0.5, 0), (3, 0, 0, -0.5), REST)
@@ -67,12 +69,9 @@ def task_sequences(machine: Machine) -> list[Commands]:
     """
     angle = np.linspace(0, 2 * np.pi, round(16 * machine.rate), endpoint=False)
     circle = [(machine.dt, 0.5 * np.cos(x), 0, 0.5 * np.sin(x)) for x in angle]
-    ways = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}
-    ways |= {"diagonal_flat": [0.5**0.5, 0.5**0.5, 0]}
-    ways |= {"diagonal_rise": [3**-0.5, -(3**-0.5), 3**-0.5]}
     seconds, speed = np.transpose(AXIS)
-    moves = {name: np.column_stack([seconds, np.outer(speed, way)]) for name, way in ways.items()}
-    moves |= {
+    moves = {
+        **{name: np.column_stack([seconds, np.outer(speed, way)]) for name, way in WAYS.items()},
         "circle": np.array([REST, *circle, REST]),
         "rectangle": np.array(RECTANGLE),
         "stop_and_go": np.array(STOP_AND_GO),
@@ -81,9 +80,9 @@ def task_sequences(machine: Machine) -> list[Commands]:
     rng = np.random.default_rng(REST_SEED)
     result = []
     for name, rows in moves.items():
-        seconds, *velocity = _with_rests(rows, rng).T
-        ticks = np.rint(seconds * machine.rate).astype(int)
-        goals = np.repeat(machine.tool_speed * np.stack(velocity, axis=1), ticks, axis=0)
+        rows = _with_rests(rows, rng)
+        ticks = np.rint(rows[:, 0] * machine.rate).astype(int)
+        goals = np.repeat(machine.tool_speed * rows[:, 1:], ticks, axis=0)
         result.append(Commands(name, goals, inward=True))
     return result
 

@@ -1,8 +1,4 @@
-"""Many seeds of one training, on this machine's cores or on a cluster.
-
-Each seed writes `seed_<n>.npz` and its learning curve; a policy that exists is not trained again.
-On a cluster all workers must have the folder.
-"""
+"""Many seeds of one training, on this machine's cores or on a cluster."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -32,8 +28,9 @@ def sweep(
 ) -> dict[str, dict[str, Mean]]:
     """Train and evaluate `seeds`; means over seeds with intervals, by sequence and figure.
 
-    They and all runs go to `sweep.json` in `out`. A seed counts once, with its mean over `starts`
-    poses. `scheduler` is the address of a dask scheduler (None: this machine).
+    They and all runs go to `sweep.json` in `out`, policies and their curves to `seed_<n>.npz`. A
+    seed counts once, with its mean over `starts` poses. `scheduler` is the address of a dask
+    scheduler, whose workers must have the folder (None: this machine).
     """
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
@@ -48,7 +45,7 @@ def sweep(
 def run_seed(
     machine: Machine, net: ActuatorNet, recipe: Recipe, out: Path, starts: int, seed: int
 ) -> Rows:
-    """Train one seed, and score it on the sequences and starts of `evaluate`.
+    """Train one seed, unless it is, and score it on the sequences and starts of `evaluate`.
 
     ValueError: the folder `out` has a policy of this seed from another training.
     """

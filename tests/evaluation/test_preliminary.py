@@ -92,10 +92,11 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
     np.testing.assert_allclose(gap.v_tool, -20 * np.diff(p, axis=0), atol=1e-12)
 
 
-def test_run__of_another_machine():
+def test_tests_and_gap__of_another_machine():
     machine = replace(MINI_EXCAVATOR, plant_dt=0.02)  # two Euler steps a tick: fast
-    net = small_net(machine, np.random.default_rng(0), machine.names)
-    tests, gap = preliminary.run(machine, net, 0)
-    assert list(tests) == ["machine", "nets"] and len(tests["nets"]["range and direction"]) == 4
+    net = small_net(machine, np.random.default_rng(0))
+    tests = preliminary.preliminary_tests(machine, net)
+    assert len(tests["range and direction"]) == 4
+    gap = preliminary.sim_to_real(machine, {"machine": PLANT, "nets": net}, 0)
     assert gap.q.shape == (30 * machine.rate, 20, machine.n)
     assert not gap.q[..., machine.locked].any()

@@ -84,29 +84,28 @@ def test_read_commands__holds_values_until_the_next_row(tmp_path):
     assert second.goals.tolist() == [[7, 8, 9]]
 
 
+STARTS = "q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n"
+OUT_OF_RANGE = r"row 3: expected angles within .*, got \[0.0, 0."
+
+
 @pytest.mark.parametrize(
-    ("rows", "message"),
+    ("read", "rows", "message"),
     [
-        ("a,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
-        ("a,1,0,0,0\na,1.01,0,0,0\n", "a tick or more after the one before, got .0.0, 0.01"),
-        ("a,1,0,0,inf\na,2,0,0,0\n", "sequence a: expected two or more rows of finite"),
-        ("", "c.csv: expected rows, got none"),
+        (s.read_commands, "a,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
+        (s.read_commands, "a,1,0,0,0\na,1.01,0,0,0\n", "a tick or more .*, got .0.0, 0.01"),
+        (s.read_commands, "a,1,0,0,inf\na,2,0,0,0\n", "two or more rows of finite"),
+        (s.read_commands, "", "expected rows, got none"),
+        (s.read_starts, "0,0.5,0.5,1.7,2.2\n", OUT_OF_RANGE),
+        (s.read_starts, "0,0.5,0.5,nan,1.2\n", OUT_OF_RANGE),
+        (s.read_starts, "0,0,-0.3,2.5,1.2\n", OUT_OF_RANGE),  # in the ground
     ],
 )
-def test_read_commands__refuses_what_is_no_sequence(tmp_path, rows, message):
+def test_read__refuses_what_is_no_sequence_or_start(tmp_path, read, rows, message):
     path = tmp_path / "c.csv"
-    path.write_text(f"sequence,time,vx,vy,vz\n{rows}")
-    with pytest.raises(ValueError, match=message) as error:
-        s.read_commands(path, BROKK_170)
-    assert str(path) in str(error.value)
-
-
-@pytest.mark.parametrize("row", ["0,0.5,0.5,1.7,2.2", "0,0.5,0.5,nan,1.2", "0,0,-0.3,2.5,1.2"])
-def test_read_starts__refuses_poses_out_of_range_or_in_the_ground(tmp_path, row):
-    path = tmp_path / "s.csv"
-    path.write_text(f"q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n{row.strip()}\n")
-    with pytest.raises(ValueError, match=r"s.csv: row 3: expected angles within .*, got \[0.0, 0."):
-        s.read_starts(path, BROKK_170)
+    head = "sequence,time,vx,vy,vz\n" if read == s.read_commands else STARTS
+    path.write_text(head + rows)
+    with pytest.raises(ValueError, match=f"^{path}: .*{message}"):
+        read(path, BROKK_170)
 
 
 def test_evaluation_starts__of_the_package_are_those_of_reproduce():
