@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -83,13 +84,12 @@ def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
 def test_reproduce__results_hold_every_run_with_its_figures(results):
     runs = results["task_space"]["runs"]
     names = [sequence.name for sequence in task_sequences(BROKK_170)]
-    keys = {(run["controller"], run["sequence"], run["start"]) for run in runs}
-    assert keys == {(c, s, i) for c in TITLES for s in names for i in range(2)}
-    scored = [run for run in runs if run["controller"] == "rl"]
+    keys = [(run["controller"], run["sequence"], run["start"]) for run in runs]
+    assert sorted(keys) == sorted(product(TITLES, names, range(2)))
+    of_rl = {name: metrics.by_start(runs, "rl", name, ERROR) for name in ("x", "y", "z", "all")}
     mean = results["task_space"]["means"]["rl"]["all"][ERROR]["mean"]
-    assert mean == pytest.approx(np.mean([run[ERROR] for run in scored]))
-    along = [run[ERROR] for run in scored if run["sequence"] in "xyz"]
-    assert results["table"]["rl"][ERROR]["mean"] == pytest.approx(np.mean(along))
+    assert mean == pytest.approx(np.mean(of_rl.pop("all")))
+    assert results["table"]["rl"][ERROR]["mean"] == pytest.approx(np.mean([*of_rl.values()]))
 
 
 def test_reproduce__answers_each_sentence_of_the_paper_on_one_page(folder, results):
