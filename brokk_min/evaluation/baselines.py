@@ -187,10 +187,7 @@ def tune(gains: Gains, cost: Callable[[Any], Array], seed: int, generations: int
 def tuned_baselines(
     machine: Machine, net: ActuatorNet, effort: Effort, seed: int, plant: Plant = PLANT
 ) -> Baselines:
-    """The `baselines` with gains by hand, and with tuned ones.
-
-    The runs are on the `plant` itself, which favours the baselines: policies see nets alone.
-    """
+    """The `baselines`, tuned on the `plant` itself, which favours them: policies see nets alone."""
     generations, num, seconds = effort
     runs = tuning_set(machine, num, seed, seconds)
     gains = first_gains(machine, plant)

@@ -44,10 +44,7 @@ def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any
 
 
 def net_claims(nets: Tests, gap: Motion) -> list[dict[str, Any]]:
-    """Do the nets behave as the paper's machine? Single tests, so numbers without an interval.
-
-    Paper: Sec. 3.2 and 4.1, Fig. 2 and 5
-    """
+    """Do the nets behave as the paper's machine? Paper: Sec. 3.2 and 4.1, Fig. 2 and 5"""
     _, up, down, _ = (np.abs(q_dot).max() for _, q_dot in nets["range and direction"].values())
     idle, moving = (response_time(*curve) for curve in nets["past movement"].values())
     errors = np.linalg.norm(gap.p_tool, axis=-1).mean(axis=0)  # m, of each run
@@ -56,17 +53,15 @@ def net_claims(nets: Tests, gap: Motion) -> list[dict[str, Any]]:
         "idle": {"idle over moving": idle / moving if idle and moving else None},
         "gap": {"in the figure": float(errors[0]), "median of runs": float(np.median(errors))},
     }
+    single = ("mean", "low", "high")  # one test each, so without an interval
     return [
-        claim(name, {"nets": {what: {"mean": x, "low": x, "high": x} for what, x in row.items()}})
+        claim(name, {"nets": {what: dict.fromkeys(single, x) for what, x in row.items()}})
         for name, row in table.items()
     ]
 
 
 def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """The claims on task-space control, of the paper's agent and each PID.
-
-    Paper: Sec. 4.2 and 5, Fig. 6
-    """
+    """The claims on the paper's agent and each PID. Paper: Sec. 4.2 and 5, Fig. 6"""
 
     def drift(names: Sequence[str]) -> dict[str, dict[str, Mean]]:
         """Of each controller, along x."""

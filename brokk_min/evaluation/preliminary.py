@@ -71,10 +71,7 @@ def preliminary_tests(machine: Machine, plant: Plant) -> Tests:
 
 
 def steps(machine: Machine, plant: Plant) -> Curves:
-    """Velocity [rad/s] over time [s] at a step up to the limit, from idle and half its opening.
-
-    The last driven joint begins at a tenth of its range. Paper: Sec. 3.2 (past movement)
-    """
+    """Velocity [rad/s] over time [s] at a step, from idle and half its opening. Paper: Sec. 3.2"""
     joint = machine.driven[-1]
     low, high = machine.column("q_min"), machine.column("q_max")
     wait = max(round(1.5 * machine.rate), 2 * machine.history)  # ticks before and after the step
@@ -90,10 +87,7 @@ def steps(machine: Machine, plant: Plant) -> Curves:
 
 
 def response_time(time: Array, velocity: Array) -> float | None:
-    """Time [s] from the step at 0 to `RISE` of the change of velocity; None: no change.
-
-    Velocities are means over a tick, taken at its middle, with lines between them.
-    """
+    """Time [s] from the step at 0 to `RISE` of the change of velocity; None: no change."""
     first = np.flatnonzero(time < 0)[-1]
     time, change = time[first:], velocity[first:] - velocity[first]
     if change.max() < 1e-3:
