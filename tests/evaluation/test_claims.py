@@ -27,10 +27,9 @@ def runs_with(error, drift):
     return rows
 
 
-def verdict(claim, controller):
-    """On one controller, or on the policy against one PID."""
-    title, verdicts = TITLES[controller], claim["verdicts"]
-    return verdicts.get(title) or verdicts[f"{TITLES[PPO]} against {title}"]
+def verdict(claim, *controllers):
+    """On one controller, or on a policy against a PID."""
+    return claim["verdicts"][" against ".join(TITLES[name] for name in controllers)]
 
 
 def step(seconds):
@@ -90,9 +89,9 @@ def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expe
     errors = {("x", PPO): x, ("z", PPO): z, PPO: 0.01, HIGH: 0.02, LOW: 0.05, RAW: 0.06}
     runs = runs_with(errors, {PPO: drift, HIGH: 0.2, LOW: 0.4, RAW: 0.4})
     result = claims.task_claims(runs)[2:]  # tracking, along z, all in all
-    assert [verdict(claim, HIGH) for claim in result] == expected
-    assert {verdict(claim, LOW) for claim in result} == {TRUE}
+    assert [verdict(claim, PPO, HIGH) for claim in result] == expected
+    assert {verdict(claim, PPO, LOW) for claim in result} == {TRUE}
     numbers = result[1]["numbers"][f"{TITLES[PPO]} against {TITLES[HIGH]}"]
     assert numbers["drift along z"]["mean"] == pytest.approx(drift - 0.2)
     one_start = claims.task_claims([run for run in runs if run["start"] == 0])[2:]
-    assert {verdict(claim, LOW) for claim in one_start} == {UNKNOWN}
+    assert {verdict(claim, PPO, LOW) for claim in one_start} == {UNKNOWN}

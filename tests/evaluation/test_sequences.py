@@ -120,18 +120,17 @@ def test_evaluation_starts__of_the_package_are_those_of_reproduce():
 
 
 def test_evaluation_starts__are_drawn_by_the_seed_for_another_machine():
-    short = [s.Commands("z", s.axis_sequences(BROKK_170)[2].goals[15:40])]
-    starts = s.evaluation_starts(replace(BROKK_170, ground=-0.1), 5, short, 3)
-    np.testing.assert_array_equal(s.draw_starts(BROKK_170, 3, short, 3), starts[:3])
-    assert (s.draw_starts(BROKK_170, 5, short, 4) != starts).any()
+    machine, short = replace(BROKK_170, ground=-0.1), s.axis_sequences(BROKK_170)[2]
+    short = [short._replace(goals=short.goals[15:40])]
+    starts = s.evaluation_starts(machine, 5, short, 3)
+    np.testing.assert_array_equal(s.draw_starts(machine, 3, short, 3), starts[:3])
+    assert (s.draw_starts(machine, 5, short, 4) != starts).any()
 
 
 def test_draw_starts__refuses_a_machine_that_can_follow_nothing(monkeypatch):
-    monkeypatch.setattr(s, "draw_pose", lambda *_: np.tile(START, (3, 1)))  # faster
-    sequences = [s.Commands("fast", np.full((2, 3), 9.0))]
-    message = "^brokk170: expected 2 starts from which the arm stays on its path, .*, got 0$"
-    with pytest.raises(ValueError, match=message):
-        s.draw_starts(BROKK_170, 2, sequences, 0)
+    monkeypatch.setattr(s, "POSES", 3)  # faster
+    with pytest.raises(ValueError, match=r"^brokk170: expected 2 starts .*, got 0$"):
+        s.draw_starts(BROKK_170, 2, [s.Commands("fast", np.full((2, 3), 9.0))], 0)
 
 
 def follows(start, goals=STILL, machine=BROKK_170):
