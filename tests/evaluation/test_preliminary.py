@@ -22,30 +22,27 @@ class TwoSpeeds:
     """Joints that move at one speed in each direction, whatever the command; keeps its inputs."""
 
     def __init__(self, up, down):
-        self.up, self.down = up, down
-        self.starts, self.commands = [], []
+        self.up, self.down, self.runs = up, down, []
 
     def reset(self, machine, q):
-        self.starts.append(q)
-        self.commands.append([])
+        self.runs.append((q, []))
         return SimpleNamespace(q=q)
 
     def step(self, machine, state, u):
-        self.commands[-1].append(u)
+        self.runs[-1][1].append(u)
         speed = np.where(u > 0, self.up, np.where(u < 0, -self.down, 0.0))
         return SimpleNamespace(q=state.q + speed * machine.dt)
 
 
 def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     plant = TwoSpeeds(0.25, 0.5)
-    tests = preliminary.preliminary_tests(BROKK_170, plant)
-    q, u = plant.starts[0], np.array(plant.commands[0])
+    sweeps, coupling, steps = preliminary.preliminary_tests(BROKK_170, plant).values()
+    (q, u), (_, u_steps) = ((q, np.array(u)) for q, u in plant.runs)
     counts = [[0, 0, 0, 0, c] for c in (50, 80, -80, -50)] + [[-80, 0, -80, 80, 80]]
     assert (u == u[0]).all() and u.shape == (800, 5, 5)
     np.testing.assert_allclose(u[0] * 127, counts)
     np.testing.assert_array_equal(q[:, 4], [LOW[4], LOW[4], HIGH[4], HIGH[4], LOW[4]])
     np.testing.assert_allclose(q[:, :4], np.tile(((LOW + HIGH) / 2)[:4], (5, 1)))
-    sweeps, coupling, steps = tests.values()
     assert list(sweeps) == ["u = 50", "u = 80", "u = 175", "u = 205"]
     speeds = [q_dot[0] for _, q_dot in sweeps.values()]
     assert speeds == pytest.approx([0.25, 0.25, -0.5, -0.5])
@@ -55,8 +52,8 @@ def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
     np.testing.assert_allclose(time, 0.05 * (np.arange(60) - 29.5))
     np.testing.assert_allclose(velocity, np.where(time < 0, 0, 0.25), atol=1e-9)
     np.testing.assert_allclose(steps["moving"][1], 0.25)
-    u = np.array(plant.commands[1])[[0, 30], :, 4]  # from rest, and from half the opening
-    np.testing.assert_allclose(u, [[0, (80 / 127 + 0.07) / 2], [80 / 127] * 2])
+    before_and_after = [[0, (80 / 127 + 0.07) / 2], [80 / 127] * 2]  # from half the opening, too
+    np.testing.assert_allclose(u_steps[[0, 30], :, 4], before_and_after)
 
 
 def test_preliminary_tests__of_the_plant_have_the_papers_response_times():
