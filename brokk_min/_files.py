@@ -89,11 +89,8 @@ def expected(path: Path, what: str) -> Iterator[None]:
     except (OSError, MemoryError):
         raise
     except Exception as error:  # zipfile, zlib, json and NumPy raise anything on damaged files
-        if str(error).startswith(f"{path}: "):
-            raise
-        told = ": expected " in str(error)
-        reason = error if told else f"expected {what}, got {brief(error)}"
-        raise ValueError(f"{path}: {reason}") from error
+        told = str(error) if ": expected " in str(error) else f"expected {what}, got {brief(error)}"
+        raise ValueError(f"{path}: {told.removeprefix(f'{path}: ')}") from error
 
 
 def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
@@ -101,12 +98,6 @@ def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any])
     for name, value in wanted.items():
         same = found.get(name) == value
         require(same, f"{path}: {name}", brief(value), brief(found.get(name)))
-
-
-def read_json(path: Path, what: str) -> Any:
-    """The content of a JSON file; ValueError: it is not `what`."""
-    with expected(path, what):
-        return json.loads(Path(path).read_text(encoding="utf-8"))
 
 
 def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:

@@ -9,23 +9,13 @@ from helpers_bus import random_policy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brokk_min._files import (
-    load_arrays,
-    numbers,
-    read_csv,
-    read_json,
-    save_arrays,
-    whole_file,
-    write_csv,
-    write_json,
-)
+from brokk_min import _files as files
 from brokk_min.learning.policy import KIND, load_policy, save_policy
 from brokk_min.machine import BROKK_170
 
 READERS = {
-    "x.npz": lambda path: load_arrays(path, "policy 8"),
-    "x.json": lambda path: read_json(path, "results"),
-    "x.csv": lambda path: numbers(path, "u", read_csv(path, "time", "u")["u"]),
+    "x.npz": lambda path: files.load_arrays(path, "policy 8"),
+    "x.csv": lambda path: files.numbers(path, "u", files.read_csv(path, "time", "u")["u"]),
 }
 
 
@@ -33,10 +23,8 @@ READERS = {
 def folder(tmp_path_factory):
     """A good file of each kind."""
     path = tmp_path_factory.mktemp("files")
-    arrays = {"w": np.arange(6.0).reshape(2, 3)}
-    save_arrays(path / "x.npz", "policy 8", {"joints": ["q1"]}, **arrays)
-    write_json(path / "x.json", {"runs": [{"sequence": "x", "reward": 0.5}]})
-    write_csv(path / "x.csv", ["run", "time", "u"], [["a", 0.0, 0.25], ["a", 0.05, -1.0]])
+    files.save_arrays(path / "x.npz", "policy 8", {"joints": ["q1"]}, w=np.arange(6.0))
+    files.write_csv(path / "x.csv", ["run", "time", "u"], [["a", 0.0, 0.25], ["a", 0.05, -1.0]])
     return path
 
 
@@ -72,7 +60,7 @@ def test_read_csv__refuses_cells_that_are_missing_or_no_numbers(tmp_path, text, 
     path = tmp_path / "x.csv"
     path.write_text(text)
     with pytest.raises(ValueError) as caught:
-        numbers(path, "u", read_csv(path, "time", "u")["u"])
+        files.numbers(path, "u", files.read_csv(path, "time", "u")["u"])
     assert str(caught.value) == f"{path}: {message}"
 
 
@@ -81,11 +69,11 @@ def test_load_policy__refuses_a_file_without_any_one_of_its_fields(tmp_path):
     path = tmp_path / "p.npz"
     save_policy(path, random_policy("paper"))
     assert load_policy(path, BROKK_170).interface == "paper"
-    header, arrays = load_arrays(path, KIND)
+    header, arrays = files.load_arrays(path, KIND)
     for place in (header, header["net"], arrays):
         for name in [*place]:
             value = place.pop(name)
-            save_arrays(path, KIND, header, **arrays)
+            files.save_arrays(path, KIND, header, **arrays)
             with pytest.raises(ValueError, match=r"^\S+p\.npz: expected [^\n]+, got .*" + name):
                 load_policy(path, BROKK_170)
             place[name] = value
@@ -95,12 +83,12 @@ def test_whole_file__leaves_the_old_file_and_no_other_if_writing_fails(tmp_path)
     path = tmp_path / "y.json"
     path.write_text("old")
     with pytest.raises(ValueError, match="JSON"):
-        write_json(path, {"x": float("nan")})
-    with pytest.raises(OSError) as caught, whole_file(path):
+        files.write_json(path, {"x": float("nan")})
+    with pytest.raises(OSError) as caught, files.whole_file(path):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
     assert path.read_text() == "old" and [*tmp_path.iterdir()] == [path]
-    write_json(path, {"x": 0.1})
+    files.write_json(path, {"x": 0.1})
     assert json.loads(path.read_text()) == {"x": 0.1}
     with pytest.raises(ValueError, match="expected a regular file, got another kind"):
-        write_json(tmp_path, {})
+        files.write_json(tmp_path, {})

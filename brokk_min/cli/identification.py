@@ -121,9 +121,8 @@ class Fit(ReadsLogs):
         warnings = [*validation.warnings(scores), *inspection.warnings(log, reports, known)]
         save_net(self.out, net)
         if self.json:
-            meta: dict[str, Any] = {"machine": name, "rate": net.rate, "history": net.history}
-            meta |= {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
-            meta |= net.training
+            files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
+            meta = {"machine": name, **files, **net.training}
             write_json(self.json, {"meta": meta, "joints": scores, "warnings": warnings})
         print(f"{self.out}: nets of {name or 'an unknown machine'}")
         print_scores(scores, warnings)

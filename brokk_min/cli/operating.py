@@ -56,7 +56,7 @@ class Drive(Command):
         self.writes(self.log)
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         with open_bus(self.interface, self.channel, self.log) as bus:
-            if self.shadow or operator is None:
+            if self.shadow:
                 drive: hw.Drive = Shadow(machine, controller, bus, operator, self.sync)
             else:
                 drive = hw.Drive(machine, controller, bus, operator)
@@ -75,11 +75,12 @@ class Drive(Command):
         check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
         return JointJog(machine, self.joint, self.counts)
 
-    def find_operator(self, machine: Machine) -> Joystick | Script | None:
-        """The joystick, or the script of a file; a shadow needs none."""
+    def find_operator(self, machine: Machine) -> Any:
+        """The joystick, or the script of a file; None: a shadow follows the tool."""
+        if self.shadow and not self.command:
+            return None
         if self.command in ("", "joystick"):
-            alone = self.shadow and not self.command
-            return None if alone else Joystick(machine, self.axes, self.button)
+            return Joystick(machine, self.axes, self.button)
         goals = [sequence.goals for sequence in read_commands(Path(self.command), machine)]
         return Script(machine, np.concatenate(goals))
 
@@ -125,10 +126,8 @@ class Play(Command):
     def __call__(self, machine: Machine) -> None:
         from brokk_min.viewer.play import play
 
-        controllers = {
-            TITLES["rl"]: find_controller(machine, self.policy, rl=True),
-            TITLES[OPTIMISED]: find_controller(machine, self.policy, rl=False),
-        }
+        policy, pid = (find_controller(machine, self.policy, rl) for rl in (True, False))
+        controllers = {TITLES["rl"]: policy, TITLES[OPTIMISED]: pid}
         play(machine, controllers, find_plant(self.plant, machine))
 
 

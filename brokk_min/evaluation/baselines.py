@@ -1,5 +1,6 @@
 """The classical controllers that the policy is compared with: gains, tuning, and files of gains."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from brokk_min._files import expect_same, expected, read_json, write_json
+from brokk_min._files import expect_same, expected, write_json
 from brokk_min.actuator import PLANT, ActuatorNet, Plant
 from brokk_min.beyond.strong_pid import StrongGains, StrongPID, static_map
 from brokk_min.evaluation.rollout import rollout
@@ -213,7 +214,7 @@ def write_gains(path: Path, pids: Baselines, meta: Mapping[str, Any]) -> None:
 def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> Baselines:
     """The baselines with gains of a file; ValueError: those of another machine or other nets."""
     with expected(path, "gains of `reproduce` or `evaluate --save-gains`"):
-        file = read_json(path, "JSON")
+        file = json.loads(path.read_text("utf-8"))
         expect_same(path, file["meta"], gains_metadata(machine, net))
         gains = {}
         for name, row in file["gains"].items():

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.linalg import norm
 from tqdm import tqdm
 
-from brokk_min._files import SHIPPED, read_json, whole_file
+from brokk_min._files import SHIPPED, whole_file
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST
 from brokk_min.evaluation.metrics import COLUMNS, Mean, Traces, interval_text
 from brokk_min.evaluation.preliminary import Curves, Motion, Tests
@@ -64,7 +65,7 @@ def first_table(results: Results) -> Any:
     """Means along x, y and z: those of the package for a trial, which are of the full chain."""
     shipped = SHIPPED / results["meta"]["machine"] / "table.json"
     trial = results["meta"]["effort"]["hours"] < 1 and shipped.exists()
-    return (read_json(shipped, "JSON") if trial else results)["table"]
+    return (json.loads(shipped.read_text("utf-8")) if trial else results)["table"]
 
 
 def render(results: Results, images: Mapping[str, str]) -> str:

@@ -1,5 +1,6 @@
 """Figures show the curves that they are given, and the page says of which machine they are."""
 
+import json
 import re
 from collections import defaultdict
 from types import SimpleNamespace
@@ -7,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 from helpers_machines import POSE
 
-from brokk_min._files import SHIPPED, read_json
+from brokk_min._files import SHIPPED
 from brokk_min.evaluation import metrics, report
 from brokk_min.evaluation.preliminary import Motion
 from brokk_min.evaluation.sequences import axis_sequences
@@ -59,7 +60,7 @@ def test_render__begins_with_one_sentence_a_figure_and_a_table():
 
 def test_render__sets_a_trial_beside_the_shipped_results_and_their_bound():
     numbers, rows, rest = first_screen(render(0.1, "brokk170"))
-    table = read_json(SHIPPED / "brokk170" / "table.json", "a table")["table"]
+    table = json.loads((SHIPPED / "brokk170" / "table.json").read_text())["table"]
     assert numbers[0] == f"{table['rl_paper']['velocity_error_mean']['mean']:.4f}"
     assert rows[3][4] == "0.0101 (0.0091 to 0.0111)" and "is of a trial" in rest
     assert rows[5][2] == "0.0097"

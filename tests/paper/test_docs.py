@@ -4,6 +4,7 @@
 """
 
 import doctest
+import json
 import re
 import shlex
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from brokk_min.__main__ import COMMANDS, main
-from brokk_min._files import SHIPPED, read_json
+from brokk_min._files import SHIPPED
 from brokk_min.evaluation.report import BOUND
 from brokk_min.machine import BROKK_170
 
@@ -38,7 +39,7 @@ SHOWN = ("pid_by_hand", "jacobian_pid_k0.1", "rl_paper", "rl", "jacobian_pid_ff_
 
 def test_readme__results_are_those_of_the_shipped_files() -> None:
     """`reproduce` writes table.json; the bound is of `benchmarks.perfect_model`."""
-    table = read_json(SHIPPED / "brokk170" / "table.json", "a table")["table"]
+    table = json.loads((SHIPPED / "brokk170" / "table.json").read_text())["table"]
     rows = RESULT.findall(README.read_text())
     assert len(rows) == 6
     for name, (_, error, drift, _) in zip(SHOWN, rows, strict=False):
