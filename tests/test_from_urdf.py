@@ -1,7 +1,5 @@
 """A machine from a URDF has its tool where Pinocchio, which reads the URDF, has it."""
 
-import re
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,35 +8,31 @@ from hypothesis import strategies as st
 pytest.importorskip("pinocchio")
 from examples import from_urdf
 
+ARM_AXIS = "-0.19866933079506122 0.9800665778412416 0"
+JOINT = """<link name="{0}"/><joint name="{0}" type="{1}">
+  <parent link="{parent}"/><child link="{0}"/><origin xyz="{2}" rpy="{3}"/>
+  <axis xyz="{4}"/><limit lower="{5}" upper="{6}" effort="1" velocity="{7}"/>{more}</joint>"""
 # The chassis frame lies behind the slew axis. Boom and arm turn about parallel axes, the arm the
 # other way round. The bucket's axis is skew to the stick's. The rod is no part of the chain.
-EXCAVATOR = """<robot name="test excavator">
-{links}
-<joint name="turret" type="fixed"><parent link="chassis"/><child link="turret"/>
-  <origin xyz="0.4 0.1 0.6" rpy="0 0 1.5707963267948966"/></joint>
-<joint name="slew" type="continuous"><parent link="turret"/><child link="cab"/>
-  <origin xyz="0 0 0.2" rpy="0 0 0.3"/><axis xyz="0 0 1"/></joint>
-<joint name="boom" type="revolute"><parent link="cab"/><child link="boom"/>
-  <origin xyz="0.3 -0.1 0.5" rpy="0 0 0"/><axis xyz="0 1 0"/>
-  <limit lower="-1.1" upper="0.6" effort="1" velocity="0.5"/></joint>
-<joint name="arm" type="revolute"><parent link="boom"/><child link="arm"/>
-  <origin xyz="1.8 0.05 0.2" rpy="3.141592653589793 0 0.2"/>
-  <axis xyz="-0.19866933079506122 0.9800665778412416 0"/>
-  <limit lower="-2.5" upper="0.4" effort="1" velocity="0.6"/></joint>
-<joint name="extension" type="prismatic"><parent link="arm"/><child link="stick"/>
-  <origin xyz="0.9 0 0" rpy="0 0.4 0"/><axis xyz="2 0 0.5"/>
-  <limit lower="0" upper="0.8" effort="1" velocity="0.2"/></joint>
-<joint name="bucket" type="revolute"><parent link="stick"/><child link="bucket"/>
-  <origin xyz="0.15 0.02 0.1" rpy="0 -0.3 0.5"/><axis xyz="0.2 -0.9 0.4"/>
-  <limit lower="-0.2" upper="2.0" effort="1" velocity="1.1"/></joint>
-<joint name="edge" type="fixed"><parent link="bucket"/><child link="edge"/>
-  <origin xyz="0.5 0.03 -0.2" rpy="0 1 0"/></joint>
-<joint name="link" type="revolute"><parent link="bucket"/><child link="rod"/>
-  <axis xyz="0 1 0"/><mimic joint="bucket" multiplier="-1"/>
-  <limit lower="0" upper="1" effort="1" velocity="1"/></joint>
-</robot>"""
-LINKS = sorted({*re.findall(r'link="(\w+)"', EXCAVATOR)})
-EXCAVATOR = EXCAVATOR.format(links="".join(f'<link name="{name}"/>' for name in LINKS))
+EXCAVATOR = (  # name of joint and link, kind, place, turn, axis, range, speed
+    ("turret", "fixed", "0.4 0.1 0.6", "0 0 1.5707963267948966", "0 0 1", 0, 0, 0),
+    ("slew", "continuous", "0 0 0.2", "0 0 0.3", "0 0 1", 0, 0, 99),
+    ("boom", "revolute", "0.3 -0.1 0.5", "0 0 0", "0 1 0", -1.1, 0.6, 0.5),
+    ("arm", "revolute", "1.8 0.05 0.2", "3.141592653589793 0 0.2", ARM_AXIS, -2.5, 0.4, 0.6),
+    ("extension", "prismatic", "0.9 0 0", "0 0.4 0", "2 0 0.5", 0, 0.8, 0.2),
+    ("bucket", "revolute", "0.15 0.02 0.1", "0 -0.3 0.5", "0.2 -0.9 0.4", -0.2, 2.0, 1.1),
+    ("edge", "fixed", "0.5 0.03 -0.2", "0 1 0", "0 0 1", 0, 0, 0),
+    ("rod", "revolute", "0 0 0", "0 0 0", "0 1 0", 0, 1, 1),
+)
+
+
+def urdf(joints):
+    """The text of a chain that begins at the link "chassis"; a rod follows the bucket."""
+    text, parent = '<robot name="test"><link name="chassis"/>', "chassis"
+    for joint in joints:
+        more = '<mimic joint="bucket" multiplier="-1"/>' if joint[0] == "rod" else ""
+        text, parent = text + JOINT.format(*joint, parent=parent, more=more), joint[0]
+    return text + "</robot>"
 
 
 def printed(text, tmp_path, capsys):
@@ -53,7 +47,7 @@ def printed(text, tmp_path, capsys):
 
 def test_excavator__has_its_tool_where_the_urdf_has_it(tmp_path, capsys):
     """The boom's axis is 0.3 m out and 1.3 m high, and the arm is 0.05 m right of the slew axis."""
-    machine, told = printed(EXCAVATOR, tmp_path, capsys)
+    machine, told = printed(urdf(EXCAVATOR), tmp_path, capsys)
     assert machine.names == ("slew", "boom", "arm", "extension", "bucket")
     assert [joint.kind for joint in machine.joints].index("prismatic") == 3
     assert machine.column("q_min").round(4).tolist() == [-3.1416, -1.1, -2.5, 0.0, -0.2]
@@ -66,35 +60,27 @@ def test_excavator__has_its_tool_where_the_urdf_has_it(tmp_path, capsys):
     assert boom.alpha == pytest.approx(np.pi)  # the arm's axis points the other way
 
 
-CHOICES = {
-    "kind": ["revolute", "revolute", "prismatic"],
-    "axis": ["1 0 0", "0 1 0", "0 0 1", "0 -1 0", "1 1 0", "0.2 -0.3 0.9"],
-    "place": ["0 0 0", "1 0 0", "0 0 0.5", "0.4 -0.3 0.2"],
-    "turn": ["0 0 0", "1.5707963267948966 0 0", "0 -1.5707963267948966 0.4", "0.3 0.5 -0.7"],
-}
-JOINT = """<joint name="j{i}" type="{kind}"><parent link="l{i}"/><child link="l{next}"/>
-  <origin xyz="{place}" rpy="{turn}"/><axis xyz="{axis}"/>
-  <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
-JOINTS = st.fixed_dictionaries({key: st.sampled_from(values) for key, values in CHOICES.items()})
-CHAINS = st.lists(JOINTS, min_size=1, max_size=5)
+KINDS = ["revolute", "revolute", "prismatic"]
+PLACES = ["0 0 0", "1 0 0", "0 0 0.5", "0.4 -0.3 0.2"]
+TURNS = ["0 0 0", "1.5707963267948966 0 0", "0 -1.5707963267948966 0.4", "0.3 0.5 -0.7"]
+AXES = ["1 0 0", "0 1 0", "0 0 1", "0 -1 0", "1 1 0", "0.2 -0.3 0.9"]
+JOINTS = st.tuples(*map(st.sampled_from, (KINDS, PLACES, TURNS, AXES)))
 
 
-@given(joints=CHAINS)
+@given(st.sampled_from(KINDS), st.sampled_from(PLACES), st.lists(JOINTS, max_size=4))
 @settings(max_examples=60)
-def test_any_chain__has_its_tool_where_the_urdf_has_it(tmp_path_factory, joints):
+def test_any_chain__has_its_tool_where_the_urdf_has_it(tmp_path_factory, kind, place, joints):
     """Axes that are parallel, coincident, opposed, that meet, and skew."""
-    joints = [{**joints[0], "axis": "0 0 1", "turn": "0 0 1"}, *joints[1:]]
-    texts = [JOINT.format(i=i, next=i + 1, **joint) for i, joint in enumerate(joints)]
-    links = "".join(f'<link name="l{i}"/>' for i in range(len(joints) + 1))
+    rows = [(kind, place, "0 0 1", "0 0 1"), *joints]
     path = tmp_path_factory.mktemp("urdf") / "any.urdf"
-    path.write_text(f'<robot name="any">{links}{"".join(texts)}</robot>')
-    chain = from_urdf.read_chain(path, "l0", f"l{len(joints)}")
+    path.write_text(urdf((f"j{i}", *row, -1, 1, 1) for i, row in enumerate(rows)))
+    chain = from_urdf.read_chain(path, "chassis", f"j{len(joints)}")
     assert from_urdf.largest_difference(chain, from_urdf.make_machine(chain)) < 1e-9
 
 
 def test_rounded_right_angles__count_as_parallel(tmp_path, capsys):
     """1.5708 is 3.7e-6 rad off; a common normal of such axes would be kilometres away."""
-    machine, _ = printed(EXCAVATOR.replace("3.141592653589793", "3.14159"), tmp_path, capsys)
+    machine, _ = printed(urdf(EXCAVATOR).replace("3.141592653589793", "3.14159"), tmp_path, capsys)
     assert machine.joints[1].alpha == pytest.approx(np.pi, abs=1e-12)
     assert abs(machine.joints[1].d) < 1
 
@@ -104,13 +90,13 @@ def test_rounded_right_angles__count_as_parallel(tmp_path, capsys):
     [
         ('"0 0 1"', '"0 0 -1"', "edge", "slew: expected an axis that points up from chassis"),
         ("</robot>", "", "edge", "robot.urdf: expected a URDF, after xacro if need be, got"),
-        ("", "", "rod", "link: expected a revolute or prismatic joint that moves by itself"),
+        ("", "", "rod", "rod: expected a revolute or prismatic joint that moves by itself"),
         ("", "", "turret", "robot.urdf: expected joints that lead from chassis to turret"),
     ],
 )
 def test_another_chain__is_refused(tmp_path, old, new, tool, message):
     path = tmp_path / "robot.urdf"
-    path.write_text(EXCAVATOR.replace(old, new))
+    path.write_text(urdf(EXCAVATOR).replace(old, new))
     with pytest.raises(ValueError) as error:
         from_urdf.read_chain(path, "chassis", tool)
     assert message in str(error.value)
