@@ -27,13 +27,11 @@ class Idle:
         return np.zeros(measured.q.shape), None
 
 
-def random_net(seed=0, n=3, history=13, hidden=32, rows=3):
+def random_net(seed=0, n=3, history=13, rows=3):
+    """Nets of the paper's size whose weights nobody fitted."""
     rng = np.random.default_rng(seed)
     inputs = rows * history
-
-    def draw(*shape):
-        return (rng.standard_normal(shape) / shape[1] ** 0.5).astype(np.float32)
-
+    sizes = ((inputs, 32), (32,), (32, 32), (32,), (32, 1), (1,))
     return ActuatorNet(
         joints=tuple(f"j{i}" for i in range(n)),
         history=history,
@@ -47,32 +45,27 @@ def random_net(seed=0, n=3, history=13, hidden=32, rows=3):
         output_high=rng.uniform(0.1, 0.6, n).astype(np.float32),
         q_low=np.full(n, -2.0, np.float32),
         q_high=np.full(n, 2.0, np.float32),
-        weights=(
-            draw(n, inputs, hidden), draw(n, hidden), draw(n, hidden, hidden), draw(n, hidden),
-            draw(n, hidden, 1), draw(n, 1),
-        ),
-    )  # fmt: skip
+        weights=tuple((rng.standard_normal((n, *s)) / s[0] ** 0.5).astype("f4") for s in sizes),
+    )
 
 
-def small_net(machine, rng, joints=(), rows=3):
+def small_net(machine, rng, joints=()):
     """`random_net` of `joints` of a machine (none: the driven ones): all inputs matter."""
     joints = joints or tuple(machine.names[i] for i in machine.driven)
     index = [machine.names.index(name) for name in joints]
     low, high = (machine.column(name)[index].astype(np.float32) for name in ("q_min", "q_max"))
     fastest = machine.q_dot_max[index].astype(np.float32)
-    net = random_net(rng, len(joints), machine.history, rows=rows)
-    mean, scale = np.zeros((2, len(joints), rows, machine.history), np.float32)
-    mean[:, 0] = (low + high)[:, None] / 2
-    scale[:] = np.array([[0.5], [0.2], [0.4], [0.5]])[:rows]
+    middle = np.stack([(low + high) / 2, 0 * low, 0 * low], axis=1)
+    spread = np.repeat(np.float32([0.5, 0.2, 0.4]), machine.history)
     return replace(
-        net,
+        random_net(rng, len(joints), machine.history),
         joints=joints,
         rate=machine.rate,
         velocity_samples=machine.velocity_samples,
         machine=machine.name,
         training={},
-        input_mean=mean.reshape(net.input_mean.shape),
-        input_scale=scale.reshape(net.input_scale.shape),
+        input_mean=middle.repeat(machine.history, axis=1),
+        input_scale=np.tile(spread, (len(joints), 1)),
         output_low=np.float32(-1.1) * fastest,
         output_high=np.float32(1.2) * fastest,
         q_low=low,
