@@ -4,7 +4,6 @@
 """
 
 import ast
-import inspect
 import re
 import runpy
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 MAKER = runpy.run_path(str(ROOT / "docs" / "annotated.py"))
 definition, name_of = MAKER["definition"], MAKER["name_of"]
+TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 PAGE = ROOT / "PAPER.md"
 PAPER, LINKS = PAGE.read_text().split(
     "<!-- links: written by `python tests/paper/test_paper.py` -->\n"
@@ -86,26 +86,16 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
-@cache
-def all_tests() -> dict[str, list[tuple[Path, int]]]:
-    """Files and lines of each test function of the suite."""
-    found: dict[str, list[tuple[Path, int]]] = {}
-    for path in sorted((ROOT / "tests").rglob("test_*.py")):
-        for node in parsed(path).body:
-            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-                found.setdefault(node.name, []).append((path, node.lineno))
-    return found
-
-
 def place_of(label: str) -> tuple[Path, int]:
     """File and line of a test, or of `module` or `module.name.name` of the package."""
     if not label.startswith("test_"):
         path, node = definition(label)
         return path, getattr(node, "lineno", 1)  # a module: its docstring
-    places = all_tests().get(label, [])
+    start = f"\ndef {label}("
+    places = [path for path in TESTS if start in path.read_text()]
     if len(places) != 1:
         raise ValueError(f"{label}: expected one test of this name, got {places}")
-    return places[0]
+    return places[0], places[0].read_text().partition(start)[0].count("\n") + 2
 
 
 def link(label: str) -> str:
@@ -123,30 +113,23 @@ def test_links__point_at_the_line() -> None:
 
 
 def documented() -> Iterator[tuple[str, str]]:
-    """Symbol and tag of each docstring of the package that names a place of the paper.
+    """Module and tag of each docstring of the package that names a place of the paper.
 
     A tag stands behind "Paper:", up to the end of the paragraph.
     """
     several = r"(Fig\.|Sec\.) ((?:\d[\d.a-h]*(?:, | and )?)+)"
     for path in sorted((ROOT / "brokk_min").rglob("*.py")):
-        nodes: list[tuple[str, ast.Module | ast.FunctionDef | ast.ClassDef]] = [
-            (path.stem, parsed(path))
-        ]
-        for symbol, node in nodes:
-            text = inspect.cleandoc(ast.get_docstring(node) or "")
-            for tagged in re.findall(r"Paper: (.*?)(?:\n\s*\n|$)", text, re.S):
-                for tag in re.findall(r"eq\d|Table \d", tagged):
-                    yield symbol, tag
-                for kind, numbers in re.findall(several, tagged):
-                    for number in re.findall(r"\d[a-h]?(?:\.\d)?", numbers):
-                        yield symbol, f"{kind} {number}"
-            parts = [part for part in node.body if isinstance(part, ast.FunctionDef | ast.ClassDef)]
-            nodes += [(f"{symbol}.{part.name}", part) for part in parts]
+        for tagged in re.findall(r'Paper: (.*?)(?:\n\s*\n|""")', path.read_text(), re.S):
+            for tag in re.findall(r"eq\d|Table \d", tagged):
+                yield path.stem, tag
+            for kind, numbers in re.findall(several, tagged):
+                for number in re.findall(r"\d[a-h]?(?:\.\d)?", numbers):
+                    yield path.stem, f"{kind} {number}"
 
 
 def test_docstrings_and_rows__name_each_other() -> None:
     """A tag `Fig. 6` stands for all its panels, and one of a module's tags for its definitions."""
-    tags = {(symbol.partition(".")[0], tag) for symbol, tag in documented()}
+    tags = set(documented())
     named = {(s.partition(".")[0], row[0]) for row in NAMED for s in labels(row[-3])}
     constants = {(s.partition(".")[0], row[1]) for row in CONSTANT for s in labels(row[-3])}
     for module, tag in tags:
