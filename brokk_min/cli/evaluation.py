@@ -33,9 +33,8 @@ class Evaluate(Command):
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         path, gains = default_policy(machine, self.policy)
         gains = None if self.save_gains else gains
-        policies = {"rl": load_policy(path, machine)}
-        if not self.policy:
-            policies |= {k: load_policy(path.with_name(f), machine) for k, f in POLICIES.items()}
+        files = {"rl": path.name} if self.policy else POLICIES
+        policies = {k: load_policy(path.with_name(f), machine) for k, f in files.items()}
         net = policies["rl"].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
         controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
