@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 import sys
 from collections import defaultdict
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +25,6 @@ from brokk_min.machine import BROKK_170, PWM_MAX
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from helpers_faults import FAULTS, NOT_FOUND, measure
-
-
-@dataclass
-class Options:
-    repeats: int = 20  # Of each fault, at other moments between two SYNCs.
-    frozen: bool = False  # Times of frozen encoders by command instead.
 
 
 def groups(faults: dict[str, Any]) -> dict[str, list[Any]]:
@@ -104,12 +97,12 @@ def frozen_table() -> None:
         print(f"| {counts} | {cells[0]} | {cells[1]} |".replace("inf", "never"))
 
 
-def main(options: Options) -> None:
-    if options.frozen:
+def main(repeats: int = 20, frozen: bool = False) -> None:
+    if frozen:
         frozen_table()
     else:
-        table(options.repeats)
+        table(repeats)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    tyro.cli(main, description=__doc__)

@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -42,20 +43,12 @@ def planted_errors() -> list[tuple[str, str, str, str]]:
     return errors
 
 
-def functions(code: types.CodeType) -> Iterator[tuple[str, types.CodeType]]:
-    """Functions and methods of a compiled module by qualified name."""
+def functions(code: types.CodeType) -> Iterator[types.CodeType]:
+    """Functions, classes and their methods, of a compiled module."""
     for part in code.co_consts:
         if isinstance(part, types.CodeType) and "<locals>" not in part.co_qualname:
-            yield part.co_qualname, part
+            yield part
             yield from functions(part)
-
-
-def function_of(module: types.ModuleType, name: str) -> Any:
-    """The function of a qualified name, without its decorators."""
-    thing: Any = module
-    for part in name.split("."):
-        thing = vars(thing).get(part)
-    return inspect.unwrap(getattr(thing, "fget", None) or getattr(thing, "func", thing))
 
 
 def clear_caches() -> None:
@@ -73,12 +66,13 @@ def planted(name: str, right: str, wrong: str) -> Iterator[None]:
     source = inspect.getsource(module)
     if source.count(right) != 1:
         raise ValueError(f"{name}: expected {right!r} once, got {source.count(right)} times")
-    before = dict(functions(compile(source, str(module.__file__), "exec")))
-    after = dict(functions(compile(source.replace(right, wrong), str(module.__file__), "exec")))
-    changed = [function_of(module, key) for key in before if before[key] != after[key]]
-    (function,) = [thing for thing in changed if isinstance(thing, types.FunctionType)]
+    before = functions(compile(source, str(module.__file__), "exec"))
+    after = functions(compile(source.replace(right, wrong), str(module.__file__), "exec"))
+    *_, changed = (new for old, new in zip(before, after) if old != new)  # a method after its class
+    thing = attrgetter(changed.co_qualname)(module)
+    function = inspect.unwrap(getattr(thing, "fget", None) or getattr(thing, "func", thing))
     kept = function.__code__
-    function.__code__ = after[kept.co_qualname]
+    function.__code__ = changed
     clear_caches()
     try:
         yield
