@@ -13,26 +13,23 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from unittest import mock
 
 import numpy as np
 from numpy.linalg import norm
 
-from benchmarks import POLICY
+from benchmarks import POLICY, ladder
 from brokk_min import jacobian, kinematics, machine
 from brokk_min.actuator import PLANT, estimate_velocity
 from brokk_min.beyond import interface
 from brokk_min.env import terminated
-from brokk_min.evaluation import metrics, preliminary, sequences
+from brokk_min.evaluation import preliminary, sequences
 from brokk_min.evaluation.baselines import OPTIMISED, read_gains
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification import excitation
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy
-from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170, PWM_MAX
 
@@ -111,20 +108,15 @@ def levels() -> Figures:
 
 
 def train() -> Figures:
-    """Error [m/s], drift [m], travel, time at stops [s] of a new policy along x, y, z."""
+    """Figures of `benchmarks.ladder` of a new policy, on the nets and on the plant."""
     net = policy.load_policy(POLICY, M).net
     recipe = find_recipe()
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=STEPS))
-    with TemporaryDirectory() as folder:
-        trained = train_policy(M, net, recipe, 0, Path(folder) / "policy.npz")
-    controllers = {"rl": trained}
-    starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
+    trained = ladder.train(net, recipe, 0)
     result = {}
     for name, plant in (("nets", net), ("plant", PLANT)):
-        axes = sequences.axis_sequences(M)
-        runs, _ = metrics.evaluate(M, controllers, axes, starts, 0, plant)
-        for key in ("velocity_error_mean", "off_axis_drift_max", "valve_travel"):
-            result[f"{name}, {key}"] = float(np.mean([run[key] for run in runs]))
+        for key, value in zip(ladder.FIGURES, ladder.figures(trained, plant), strict=True):
+            result[f"{name}, {key}"] = value
     return result
 
 

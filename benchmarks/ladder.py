@@ -19,14 +19,14 @@ import numpy as np
 
 import benchmarks  # noqa: F401, before NumPy computes: one thread
 from brokk_min import env
-from brokk_min.actuator import ActuatorNet
+from brokk_min.actuator import PLANT, ActuatorNet, Plant
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.evaluation import metrics, sequences
-from brokk_min.identification.net_file import load_net, select_nets
+from brokk_min.identification.net_file import load_net
 from brokk_min.learning import policy
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
-from brokk_min.learning.recipes import find_recipe
+from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.machine import BROKK_170 as M
 
 FIGURES = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "jerk_rms")
@@ -66,27 +66,33 @@ def climb(name: str, nets: dict[str, ActuatorNet], total_steps: int, seed: int) 
     learner = replace(recipe.learner, total_steps=total_steps)
     recipe = replace(recipe, interface=name, learner=learner)
     net = nets["net" if "nets" in steps else "net_paper"]
+    return figures(train(net, recipe, seed), PLANT)
+
+
+def train(net: ActuatorNet, recipe: Recipe, seed: int) -> policy.Policy:
+    """A new policy that learned on the nets; its file and its curve are not kept."""
     with TemporaryDirectory() as folder:
-        trained = train_policy(M, net, recipe, seed, Path(folder) / "policy.npz")
+        return train_policy(M, net, recipe, seed, Path(folder) / "policy.npz")
+
+
+def figures(trained: policy.Policy, plant: Plant) -> list[float]:
+    """`FIGURES` of a policy on a plant: means over x, y, z and 32 starts."""
     starts = sequences.evaluation_starts(M, 32, sequences.task_sequences(M), 2)
-    controllers = {"rl": trained}
-    runs, _ = metrics.evaluate(M, controllers, sequences.axis_sequences(M), starts, 0)
+    axes = sequences.axis_sequences(M)
+    runs, _ = metrics.evaluate(M, {"rl": trained}, axes, starts, 0, plant)
     return [float(np.mean([run[key] for run in runs if run[key] is not None])) for key in FIGURES]
 
 
 def main(folder: str = "results", steps: str = "1000000", seeds: str = "3") -> None:
-    nets = {
-        name: select_nets(M, load_net(Path(folder) / f"{name}.npz", M))
-        for name in ("net", "net_paper")
-    }
+    files = {name: Path(folder) / f"{name}.npz" for name in ("net", "net_paper")}
+    nets = {name: load_net(file, M) for name, file in files.items()}
     jobs = {
         f"{rung}, seed {seed}": partial(climb, rung, nets, int(steps), seed)
         for rung in RUNGS
         for seed in range(int(seeds))
     }
-    results = np.array(list(side_by_side(jobs).values())).reshape(
-        len(RUNGS), int(seeds), len(FIGURES)
-    )
+    results = np.array(list(side_by_side(jobs).values()))
+    results = results.reshape(len(RUNGS), int(seeds), len(FIGURES))
     print(f"{'means of seeds (largest less smallest)':76}", *(f"{key:>22}" for key in FIGURES))
     for rung, figures in zip(RUNGS, results, strict=True):
         pairs = zip(figures.mean(axis=0), np.ptp(figures, axis=0), strict=True)

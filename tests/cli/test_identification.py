@@ -89,14 +89,6 @@ def test_fit__knows_the_machine_of_a_log_and_the_papers_recipe(tmp_path, capsys)
         assert (net.machine, isinstance(net, ValveNet)) == (machine, valve)
         assert net.training["settings"]["rollout"] == (1 if "paper" in options else 8)
         assert log != own or net.joints == BROKK_170.names  # in the order of the machine
-    slow = tmp_path / "slow.py"
-    slow.write_text(
-        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
-        "SLOW = replace(BROKK_170, name='slow', rate=10.0, velocity_samples=3, history=6)\n"
-    )
-    assert run(f"fit --force {TINY} --rollout 1 --machine {slow}:SLOW", own, "--out", out) == 0
-    net = load_net(out)
-    assert (net.machine, net.rate, net.velocity_samples, net.history) == ("slow", 10.0, 3, 6)
 
 
 def test_collect__records_what_read_log_reads(tmp_path):
