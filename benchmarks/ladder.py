@@ -94,8 +94,8 @@ def main(folder: str = "results", steps: str = "1000000", seeds: str = "3") -> N
     results = np.array(list(side_by_side(jobs).values()))
     results = results.reshape(len(RUNGS), int(seeds), len(FIGURES))
     print(f"{'means of seeds (largest less smallest)':76}", *(f"{key:>22}" for key in FIGURES))
-    for rung, figures in zip(RUNGS, results, strict=True):
-        pairs = zip(figures.mean(axis=0), np.ptp(figures, axis=0), strict=True)
+    for rung, of_seeds in zip(RUNGS, results, strict=True):
+        pairs = zip(of_seeds.mean(axis=0), np.ptp(of_seeds, axis=0), strict=True)
         cells = [f"{mean:.4f} ({spread:.4f})" for mean, spread in pairs]
         print(f"{rung:76}", *(f"{cell:>22}" for cell in cells))
 

@@ -76,6 +76,7 @@ class Sweep(Training):
 
         recipe = self.recipe()
         check(self.seeds > 0, "--seeds", "1 or more", self.seeds)
+        check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         seeds = range(self.seed, self.seed + self.seeds)
         net = load_net(self.actuator, machine)
         table = sweep(machine, net, recipe, seeds, self.out, self.num_starts, self.scheduler)

@@ -99,6 +99,7 @@ VIRTUAL = "drive --interface virtual --channel v"
         (f"{TRAIN} --gamma 1.0", 2, "--gamma: expected below 1, got 1.0"),
         (f"{TRAIN} --hold-max-s 0.4", 2, "--hold-max-s: expected 0.5 or more, got 0.4"),
         ("sweep --actuator missing.npz --out s --seeds 0", 2, "--seeds: expected 1 or more, got 0"),
+        ("sweep --actuator m.npz --out s --num-starts 0", 2, "--num-starts: expected 1 or more"),
         ("evaluate --num-starts 0", 2, "--num-starts: expected 1 or more, got 0"),
         ("machine --interface nonsense --channel 0", 1, "nonsense 0: expected a CAN bus, got"),
         (f"{VIRTUAL} --controller jog --joint q2", 2, "--joint: expected one of ['q1', 'q3',"),

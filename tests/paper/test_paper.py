@@ -179,13 +179,8 @@ def test_tests__use_the_code_of_their_row(code: str, test: str) -> None:
 
 
 def write() -> None:
-    """Write the links at the end of PAPER.md; print what is no longer there."""
-    lines = []
-    for label in LABELS:
-        try:
-            lines.append(link(label))
-        except ValueError as error:
-            print(error)
+    """Write the links at the end of PAPER.md; ValueError: the first that is no longer there."""
+    lines = [link(label) for label in LABELS]
     PAGE.write_text(PAGE.read_text().removesuffix(LINKS) + "\n" + "\n".join(lines) + "\n")
 
 
