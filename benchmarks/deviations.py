@@ -8,8 +8,6 @@ prints that entry alone. D5 and D7 train policies, for some five minutes. `bench
 what the parts of our agent are worth in other learners.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import replace

@@ -7,8 +7,6 @@ Machine, bus and `hw.Drive` run in one process on one clock. A fault of an encod
 the joints. `--frozen` prints instead how long a frozen encoder takes at each command.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections import defaultdict

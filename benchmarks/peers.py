@@ -9,8 +9,6 @@ settings were the best of six random ones for each of the four learners (commit 
 search). Stable-Baselines3 is no dependency: `pip install stable-baselines3`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Iterable

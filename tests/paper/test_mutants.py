@@ -5,8 +5,6 @@ changed function's code takes the place of the right one in the same function ob
 who imported it runs the wrong code.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import itertools
