@@ -13,7 +13,7 @@ from brokk_min.identification.logs import Log, Recording, read_log, write_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.machine import BROKK_170
 
-TINY = "--steps 1 --batch-size 8"
+TINY = "--steps 1 --batch-size 1"
 MIXED = BROKK_170.names[::-1]  # in another order than the machine's
 
 
