@@ -150,7 +150,7 @@ def initial_weights(data: TrainingSet, config: FitConfig, generator: Generator) 
     return [weight.requires_grad_() for weight in weights]
 
 
-def draw_windows(windows: list[NDArray[np.intp]], batch: int, generator: Generator) -> Tensor:
+def draw_windows(windows: list[Rows], batch: int, generator: Generator) -> Tensor:
     """Newest samples (batch, n) of random windows of each joint."""
     rows = [torch.randint(len(ends), (batch,), generator=generator).numpy() for ends in windows]
     return torch.tensor(np.stack([ends[at] for ends, at in zip(windows, rows)], axis=1))
