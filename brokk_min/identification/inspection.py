@@ -160,6 +160,9 @@ def warnings(
     """What a log lacks, and where it contradicts the range of the machine that it should be of."""
     yield from log.warnings
     yield from wrong_signs(reports)
+    for name in log.joints:
+        if name not in reports:
+            yield f"{name}: expected commands in the log, got none"
     joints = {joint.name: joint for joint in machine.joints} if machine else {}
     for name, r in reports.items():
         if r.minutes < LEAST_MINUTES:

@@ -74,8 +74,10 @@ def test_inspect__leaves_out_joints_without_commands_and_directions_without_moti
     still = record("boom", holds())._replace(q=np.zeros((4000, 2)), q_dot=np.zeros((4000, 2)))
     report = inspect(log_of(still))["boom"]
     assert (report.explained, report.sign) == (0, 0)
-    upwards = inspect(log_of(record("boom", np.abs(holds()))))
+    log = log_of(record("boom", np.abs(holds())))
+    upwards = inspect(log)
     assert list(upwards) == ["boom"]
+    assert "arm: expected commands in the log, got none" in warnings(log, upwards, None)
     assert upwards["boom"].dead_zone[0] == pytest.approx(0.12, abs=0.011)
     short = Recording("", *(x[5:9] for x in record("boom", holds())[1:]))  # 0.2 s
     assert np.isfinite(inspect(log_of(short))["boom"].explained)
