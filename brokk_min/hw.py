@@ -113,10 +113,10 @@ class Drive:
         u, self.controller_state = self.controller(self.measured, self.controller_state)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
-    def inputs(self, command: Array, counts: Array) -> GateInputs:
-        """What the gate gets of this tick."""
+    def send_command(self, command: Array, counts: Array) -> None:
+        """Pass the safety gate, and send the valve frame once the gate was armed."""
         entered = self.operator_input
-        return GateInputs(
+        inputs = GateInputs(
             command=command,
             counts=counts,
             frames=self.nodes.frames,
@@ -130,10 +130,6 @@ class Drive:
             flooded=np.array(self.nodes.received >= canopen.MAX_FRAMES),
             other_sender=np.array(self.nodes.others > 0),
         )
-
-    def send_command(self, command: Array, counts: Array) -> None:
-        """Pass the safety gate, and send the valve frame once the gate was armed."""
-        inputs = self.inputs(command, counts)
         self.gate, frame = gate(self.machine, self.gate, inputs, self.bus.now())
         self.last_exception = "" if self.gate.driving else self.exception or self.last_exception
         self.exception = ""  # one while sending is a fault of the next tick
