@@ -1,11 +1,9 @@
 """Another interface between agent and machine: what our agent reads, remembers, does and pays.
 
-What it changes: of the paper's observation (`env`) our agent reads the newer half of velocities and
-commands, and one smoothed angle of each joint; its velocity of the tool is as old as those of the
-joints. It also reads which of these commands opened valves, the joint velocities that would give
-the goal, and those that would undo the velocity error so far. Its actions begin beyond the dead
-zone, its valves open wider shortly before they answer and close while the tool rests, and it pays
-for large commands, valve travel and error that lasts.
+What it changes: our agent reads a shorter history than the paper's, and also which commands opened
+valves and which joint velocities would give the goal and undo the velocity error so far (the second
+table). Its actions begin beyond the dead zone, its valves open wider shortly before they answer and
+close while the tool rests, and it pays for large commands, valve travel and error that lasts.
 
 What it buys, in order, trained with `group_advantages` on our nets for one million steps (means of
 three seeds along x, y and z, `benchmarks.ladder`):
@@ -73,10 +71,9 @@ class Memory(NamedTuple):
 def remember(machine: Machine, memory: Memory | None, measured: Measured) -> Memory:
     """What the agent keeps, with the tool's velocity J q_dot at the time of q_dot.
 
-    The velocity of a joint is the slope through w angles, so it is (w - 1) / 2 ticks old. By the
-    Jacobian of now the tool's velocity would point to one side, the same when the arm moves back,
-    and the integral would turn that into a drift. So J is that of q - (w - 1) / 2 dt q_dot, where
-    the driven joints were then.
+    The velocity of a joint is the slope through w angles, so it is (w - 1) / 2 ticks old, and J is
+    that of q - (w - 1) / 2 dt q_dot, where the driven joints were then. By the Jacobian of now the
+    velocity would point to one side, to and fro, and the integral would make a drift of that.
     """
     q_dot = np.zeros_like(measured.q)
     q_dot[..., machine.driven] = measured.q_dot
@@ -89,10 +86,9 @@ def remember(machine: Machine, memory: Memory | None, measured: Measured) -> Mem
 def accumulate(machine: Machine, memory: Memory | None, measured: Measured) -> Memory:
     """I_{t+1} = exp(-dt / T) (I_t + dt e), e = v_goal - v_tool, cut along the goal and across it.
 
-    That is the I of a PI controller, with a leak. Along the goal e counts up to 2 % of the tool
-    speed, so that nobody makes up for a late start by too much speed; across it, and while the goal
-    is zero, up to 7 %. The goal is that of the tick that has ended. It also counts for how many
-    ticks each valve has been open, as far as the history shows it.
+    Along the goal e counts up to 2 % of the tool speed, so that nobody makes up for a late start by
+    too much speed; across it, and while the goal is zero, up to 7 %. The goal is that of the tick
+    that has ended. `open_ticks` are those since which each valve is open in the history.
     """
     v_goal, v_tool = measured.v_goal, measured.v_tool
     u, zones = measured.history[..., 2, :], machine.dead_zones[machine.driven, None]
@@ -115,18 +111,12 @@ def accumulate(machine: Machine, memory: Memory | None, measured: Measured) -> M
     return Memory(v_goal, v_tool, integral.astype(np.float32), ticks, open_ticks)
 
 
-def resting(machine: Machine, memory: Memory) -> NDArray[np.bool_]:
-    """Has the goal been zero for long enough to close the valves? (...)"""
-    return np.asarray(memory.rest_ticks > REST_AFTER * machine.rate)
-
-
 def smooth_angles(machine: Machine, history: Array) -> Array:
     """Present angles [rad] (..., n), from all samples of a history (..., n, 3, H).
 
     Each old sample is extrapolated to now with the velocities measured since, and the results are
-    averaged. A slope over w angles is (w - 1) / 2 ticks old and the mean velocity of the last tick
-    half a tick, so the slope lags it by w / 2 - 1 ticks. The mean has 0.28 of the newest angle's
-    noise in training.
+    averaged. A slope over w angles lags the mean velocity of the last tick by w / 2 - 1 ticks. The
+    average has 0.28 of the newest angle's noise in training.
     """
     q, q_dot = history[..., 0, :], history[..., 1, :]
     since = q_dot.sum(axis=-1, keepdims=True) - q_dot.cumsum(axis=-1)
@@ -183,10 +173,9 @@ def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
 def command(machine: Machine, action: Array, memory: Memory) -> Array:
     """u (..., n) = zone clip(a / 0.01, -1, 1) + (limit - zone) a of actions (..., n_driven).
 
-    It is 0 once the goal has been 0 for 0.1 s; until then the agent may brake. A closed valve
-    answers late, so from 0.25 to 0.4 s after it was last closed its action is multiplied by 1.25.
-
-    An action of 0.01 therefore begins to open a valve, and valves close at rest. Paper: Sec. 3.3
+    An action of 0.01 begins to open a valve. A closed valve answers late, so from 0.25 to 0.4 s
+    after it was last closed its action is multiplied by 1.25. Once the goal has been 0 for 0.1 s
+    all valves close; until then the agent may brake. Paper: Sec. 3.3
     """
     a = np.asarray(action)
     early, late = (round(seconds * machine.rate) for seconds in (EARLY, LATE))
@@ -196,7 +185,8 @@ def command(machine: Machine, action: Array, memory: Memory) -> Array:
     u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
     u[..., machine.driven] = zone * np.clip(a / COMPENSATION, -1, 1)
     u[..., machine.driven] += (machine.pwm_limit / PWM_MAX - zone) * a
-    return np.where(resting(machine, memory)[..., None], 0, limit_command(machine, u))
+    resting = memory.rest_ticks > REST_AFTER * machine.rate
+    return np.where(resting[..., None], 0, limit_command(machine, u))
 
 
 def cost(machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:

@@ -5,8 +5,7 @@ matrix whose singular values are all one, so small directions of M count as much
 
     M = U S V^T,   W <- W - lr 0.2 sqrt(size) U V^T,
 
-where `size` is the longer side of W, which makes steps as large as Adam's. Biases are no matrices.
-They stay zero.
+where `size` is the longer side of W, which makes steps as large as Adam's. Biases stay zero.
 
 What it buys: trained to the end our agent has a velocity error of 0.0113 instead of 0.0118 m/s on
 motions that are never scored (one seed). The paper's agent gains early by it, but had 0.0149 m/s
@@ -28,10 +27,8 @@ from brokk_min.settings import PPOConfig
 
 
 def muon(agent: Agent, config: PPOConfig) -> torch.optim.Muon:
-    """The optimiser of the actor's matrices; its biases learn no more.
-
-    ValueError: a deviation of the actions that is learned, because it is no matrix.
-    """
+    """The optimiser of the actor's matrices; its biases learn no more."""
+    # a deviation of the actions that is learned would be no matrix
     require(config.log_std_end is not None, "log_std_end", "a number with Muon", None)
     layers = [layer for layer in agent.actor if isinstance(layer, nn.Linear)]
     for layer in layers:

@@ -47,12 +47,7 @@ def opening(u: Any, dead_zones: Any, xp: ModuleType = np) -> Any:
 
 
 def mu_law(x: Any, xp: ModuleType = np) -> Any:
-    """sign(x) ln(1 + mu |x|) / ln(1 + mu) of openings x (...).
-
-    Example:
-        >>> mu_law(np.array([-1.0, 0.0, 0.01, 0.25])).round(2)
-        array([-1.  ,  0.  ,  0.1 ,  0.66])
-    """
+    """sign(x) ln(1 + mu |x|) / ln(1 + mu) of openings x (...)."""
     return xp.sign(x) * xp.log1p(MU * xp.abs(x)) / math.log1p(MU)
 
 
