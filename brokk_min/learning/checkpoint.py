@@ -32,14 +32,13 @@ def train_policy(
 ) -> Policy:
     """Train a policy on the nets of the driven joints and write it to `out`.
 
-    The same `seed` gives the same bits on the same computer. The checkpoint `<out>.checkpoint` and
-    the curve `<out>.csv` lie next to the policy. Where a checkpoint exists, the training goes on
-    from it, and the result is the same as without the break. ValueError: a checkpoint of another
-    training, or a number that is not finite. OSError: a file that cannot be written; the last
-    checkpoint stays.
+    The same `seed` gives the same bits on the same computer. `<out>.checkpoint` and the curve
+    `<out>.csv` lie next to the policy. Where a checkpoint exists, the training goes on from it, and
+    the result is the same as without the break. ValueError: a checkpoint of another training, or a
+    loss that is not finite.
     """
-    about: dict[str, Any] = {"contract": contract(machine), "actuator": fingerprint(net)}
-    about |= {"seed": seed, "recipe": asdict(recipe)}
+    about = {"contract": contract(machine), "actuator": fingerprint(net), "seed": seed}
+    about["recipe"] = asdict(recipe)
     torch.set_num_threads(1)  # several wait in vain on busy cores
     config, checkpoint = recipe.learner, Path(f"{out}.checkpoint")
     env, advantages, start = prepare(machine, net, recipe, seed)
@@ -56,8 +55,8 @@ def train_policy(
             write_csv(Path(f"{out}.csv"), rows[0], [row.values() for row in rows])
             save(checkpoint, about, env, now, rows)
 
-    options: dict[str, Any] = {"initial": start.global_step, "unit_scale": True, "disable": None}
-    with tqdm(desc="train", total=config.total_steps, unit="step", **options) as bar:
+    size: dict[str, Any] = {"total": config.total_steps, "initial": start.global_step}
+    with tqdm(desc="train", **size, unit="step", unit_scale=True, disable=None) as bar:
         agent = ppo.train(env, config, seed, advantages, on_update, start)
     policy = Policy(machine, about, actor_weights(agent), net, recipe.interface)
     save_policy(out, policy)
@@ -71,11 +70,10 @@ def prepare(
     """The environments of a recipe, its advantages, and the beginning of its training."""
     config = recipe.learner
     simulation = (config.num_envs, net, machine, recipe.task, INTERFACES[recipe.interface])
+    env: TaskVectorEnv = TaskVectorEnv(*simulation)
     advantages: ppo.Advantages = ppo.critic_advantages
-    env = TaskVectorEnv(*simulation)
     if not recipe.critic:
-        advantages = group_advantages
-        env = GroupVectorEnv(*simulation, horizon=config.horizon)
+        env, advantages = GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
     start = ppo.begin(env, config, seed)
     if recipe.muon:
         start = start._replace(optimizer=muon(start.agent, config))
@@ -122,10 +120,7 @@ def save(
 def load(
     path: Path, about: dict[str, Any], env: TaskVectorEnv, fresh: Checkpoint
 ) -> tuple[Checkpoint, Rows]:
-    """The training of a checkpoint and its curve, in place of a fresh one of the same settings.
-
-    ValueError: no checkpoint, or one of another training, with the first difference.
-    """
+    """The training of a checkpoint and its curve, in place of a fresh one of the same settings."""
     with expected(path, "a readable checkpoint"):
         content = torch.load(path, weights_only=True)  # executes nothing
         expect_same(path, json.loads(content["about"]), about)

@@ -32,12 +32,9 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """Many machines that follow random tool velocities. Paper: Fig. 4
 
     `info["velocity_error"]` is |v_goal - v_tool| [m/s], and `info["new_goal"]` says where the goal
-    has changed since. If ended episodes reset in the same step, `info["final_obs"]` holds the last
-    observation of an episode where `info["_final_obs"]` is set.
-
-    Gymnasium's `AutoresetMode` explains when an ended episode resets; its vector wrappers of
-    observations accept NEXT_STEP. `max_episode_steps` counts ticks and stands for the seconds of
-    `config`. The mode "rgb_array" renders the first machine. ValueError: an argument that is wrong.
+    has changed since. Gymnasium explains `AutoresetMode` and `info["final_obs"]`; its vector
+    wrappers of observations accept NEXT_STEP. `max_episode_steps` counts ticks and stands for the
+    seconds of `config`. "rgb_array" renders the first machine. ValueError: a wrong argument.
     """
 
     copies = 1  # neighbours that share starts, goals, noise and ends: `beyond.group_advantages`
@@ -62,12 +59,13 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         require(hasattr(plant, "step"), "plant", "reset and step", plant)
         if max_episode_steps is not None:
             config = replace(config, episode_s=max_episode_steps / machine.rate)
-        rate, mode = round(machine.rate), AutoresetMode(autoreset_mode)
-        self.metadata = TaskEnv.metadata | {"render_fps": rate, "autoreset_mode": mode}
+        self.mode = AutoresetMode(autoreset_mode)
+        self.metadata = TaskEnv.metadata | {"autoreset_mode": self.mode}
+        self.metadata["render_fps"] = round(machine.rate)
         self.num_envs, self.plant, self.machine, self.config = num_envs, plant, machine, config
         self.interface, self.render_mode = interface, render_mode
-        size = len(interface.scale(machine)[0])
-        self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        mean, _ = interface.scale(machine)
+        self.single_observation_space = Box(-np.inf, np.inf, mean.shape, np.float32)
         self.single_action_space = Box(-1.0, 1.0, (len(machine.driven),), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -76,10 +74,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Draw new episodes for all machines, or where the option `reset_mask` is true.
-
-        ValueError: a mask of another shape or type.
-        """
+        """Draw new episodes for all machines, or where the option `reset_mask` is true."""
         super().reset(seed=seed)
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         fits = mask.shape == (self.num_envs,) and mask.dtype == bool
@@ -101,9 +96,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
 
     def observe(self, state: State, memory: Any) -> tuple[Array, Any]:
         """Observation with fresh noise (5 % in the paper), and the agent's memory with it."""
-        m = self.machine
-        noise = draw_noise(m, self.config.noise, len(state.q) // self.copies, self.np_random)
-        noise = noise.repeat(self.copies, axis=0)
+        m, num = self.machine, len(state.q) // self.copies
+        noise = draw_noise(m, self.config.noise, num, self.np_random).repeat(self.copies, axis=0)
         measured = measure(m, state.history, state.v_goal, noise)
         memory = self.interface.remember(m, memory, measured)
         return self.interface.observe(m, measured, memory), memory
@@ -124,13 +118,13 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         terminated, truncated = of_groups.repeat(self.copies, axis=-1) & ~begin
         truncated = truncated & ~terminated
         reward = np.where(terminated | begin, 0.0, reward - cost)
-        ended, mode = terminated | truncated, self.metadata["autoreset_mode"]
+        ended = terminated | truncated
         if begin.any():
             self.begin_episodes(begin)
-        if mode == AutoresetMode.SAME_STEP and ended.any():
+        if self.mode == AutoresetMode.SAME_STEP and ended.any():
             info |= {"final_obs": self.obs, "_final_obs": ended}
             self.begin_episodes(ended)
-        self.waiting = ended & (mode == AutoresetMode.NEXT_STEP)
+        self.waiting = ended & (self.mode == AutoresetMode.NEXT_STEP)
         return self.obs, reward, terminated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:

@@ -34,7 +34,7 @@ def side_by_side(
 
     A call receives the results of those that it `needs`, which stand before it. The others begin
     in their order, so the longest should stand first. The first exception is raised. OSError: no
-    scheduler answers at that address. ValueError: it has workers of several threads.
+    scheduler answers. ValueError: it has workers of several threads.
     """
     from distributed import Client, as_completed  # slow to import
 

@@ -39,12 +39,11 @@ class Policy:
         Paper: Sec. 3.4 (256-128-64, ELU)
         """
         x: Array = np.asarray(observation, np.float32)
-        layers = list(zip(self.weights[::2], self.weights[1::2], strict=True))
-        for w, b in layers[:-1]:
+        *hidden, w_out, b_out = self.weights
+        for w, b in zip(hidden[::2], hidden[1::2], strict=True):
             x = x @ w + b
             x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))  # ELU
-        w, b = layers[-1]
-        return np.asarray(x @ w + b)
+        return np.asarray(x @ w_out + b_out)
 
     def start(self, num: int) -> None:
         """The agent remembers nothing yet."""
@@ -88,10 +87,7 @@ def save_policy(path: Path, policy: Policy) -> None:
 
 
 def load_policy(path: Path, machine: Machine) -> Policy:
-    """Read a policy for `machine`.
-
-    ValueError: not a policy file, or one for another machine, with the first difference.
-    """
+    """Read a policy for `machine`; ValueError: its first difference from the machine."""
     header, arrays = load_arrays(path, KIND)
     with expected(path, "a complete policy"):
         expect_same(path, header["contract"], contract(machine))
