@@ -155,10 +155,9 @@ def test_the_table_of_the_docstring__is_true():
 def test_initial_state__is_at_rest():
     """Two machines with one goal."""
     state = env.initial_state(BROKK_170, [POSE, POSE], [0.1, 0.0, 0.0])
-    assert state.q.shape == state.q_dot.shape == (2, 5)
-    assert state.v_goal.shape == state.v_tool.shape == (2, 3)
-    assert state.ticks.shape == state.goal_ticks.shape == (2,)
-    assert not state.q_dot.any() and not state.v_tool.any() and not state.ticks.any()
+    for name, shape in (("q_dot", (2, 5)), ("v_tool", (2, 3)), ("ticks", (2,))):
+        assert np.array_equal(getattr(state, name), np.zeros(shape))
+    assert (state.q.shape, state.v_goal.shape, state.goal_ticks.shape) == ((2, 5), (2, 3), (2,))
     assert state.v_goal.dtype == np.float32 and state.ticks.dtype == int
 
 

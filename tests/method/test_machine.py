@@ -128,17 +128,14 @@ def test_a_replaced_machine__has_columns_and_joints_of_its_own():
 # --- the PWM byte ---------------------------------------------------------------------------------
 
 
-def test_bytes__of_the_paper():
-    u_byte = [0, 80, 175, 50, 205, 127, 128, 254]
-    counts = np.array([0, 80, -80, 50, -50, 127, -127, -1])
-    np.testing.assert_allclose(decode_pwm(u_byte) * 127, counts, atol=1e-12)
-    assert encode_pwm(counts / 127).tolist() == u_byte
-
-
 def test_decode_pwm__of_every_byte_is_the_rule_of_the_paper():
-    """[0, 127] is positive and [255, 128] negative, as a dictionary written from that sentence."""
+    """[0, 127] is positive and [255, 128] negative, as a dictionary written from that sentence.
+
+    Of its pairs 80/175 and 50/205 each sums to 255.
+    """
     meaning = {u_byte: u_byte for u_byte in range(128)}
     meaning |= {u_byte: -m for m, u_byte in enumerate(range(255, 127, -1))}
+    assert (meaning[175], meaning[205]) == (-80, -50)
     decoded = decode_pwm(np.arange(256))
     np.testing.assert_allclose(decoded * 127, [meaning[b] for b in range(256)], atol=1e-12)
     again = encode_pwm(decoded)
