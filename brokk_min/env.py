@@ -111,12 +111,7 @@ def features(machine: Machine, measured: Measured, memory: Any = None) -> Array:
 def action_to_pwm(machine: Machine, action: ArrayLike, memory: Any = None) -> Array:
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
-    ValueError: a wrong shape, or a number that is not finite.
-
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> action_to_pwm(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
-        array([ 80.,   0., -40.,   0.,  80.])
+    They need no `memory`. ValueError: a wrong shape, or a number that is not finite.
     """
     a = np.asarray(action)
     if a.shape[-1:] != machine.driven.shape or not np.isfinite(a).all():

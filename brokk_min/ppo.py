@@ -2,7 +2,7 @@
 
 It trains on a Gymnasium vector environment with Box spaces that resets in the same step. A
 truncated episode did not fail: its return goes on with the value of its own last observation. At a
-termination it stops. Advantages come from a critic, or from another function than the paper's.
+termination it stops. Advantages come from a critic, as in the paper, or from another function.
 Names follow CleanRL's where they can; target_kl steers the learning rate. Paper: Sec. 3.4
 """
 
