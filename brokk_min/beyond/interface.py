@@ -136,13 +136,13 @@ def observation_scale(machine: Machine) -> tuple[Array, Array]:
     angles = slice(first, first + 2 * n * H, 2 * H)  # one of each joint
     q_dot_std, u_std = env.velocity_deviations(machine)[1][machine.driven], std[-1]
     fading = np.exp(-np.arange(H // 2)[::-1] / (FADE * H))
-    fading, ones = np.tile(fading / np.linalg.norm(fading), n), np.ones(n * (H // 2))
+    fading = np.tile(fading / np.linalg.norm(fading), n)
     blocks: list[tuple[Any, ...]] = [  # means, deviations, weights
         (mean[:first], std[:first], 0.75),
         (mean[angles], std[angles], 1.0),
         (0.0, np.repeat(q_dot_std, H // 2), fading),
-        (0.0, u_std * ones, fading),
-        (0.5, 0.5 * ones, fading),
+        (0.0, u_std, fading),
+        (0.5, 0.5, fading),
         (0.0, q_dot_std, 1.5),
         (0.0, 0.1 * q_dot_std, 1.5),
     ]

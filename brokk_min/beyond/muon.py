@@ -19,7 +19,6 @@ It plugs into `ppo.train` as the optimiser of the checkpoint with which a traini
 """
 
 import torch
-from torch import nn
 
 from brokk_min.machine import require
 from brokk_min.ppo import Agent
@@ -30,9 +29,8 @@ def muon(agent: Agent, config: PPOConfig) -> torch.optim.Muon:
     """The optimiser of the actor's matrices; its biases learn no more."""
     # a deviation of the actions that is learned would be no matrix
     require(config.log_std_end is not None, "log_std_end", "a number with Muon", None)
-    layers = [layer for layer in agent.actor if isinstance(layer, nn.Linear)]
-    for layer in layers:
-        layer.bias.requires_grad_(False)
-    matrices = [layer.weight for layer in layers]
+    for parameter in agent.actor.parameters():
+        parameter.requires_grad_(parameter.ndim == 2)
+    matrices = [parameter for parameter in agent.actor.parameters() if parameter.ndim == 2]
     rate, rule = config.learning_rate, "match_rms_adamw"
     return torch.optim.Muon(matrices, lr=rate, weight_decay=0.0, adjust_lr_fn=rule)
