@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from helpers_bus import BASELINE, START, ConstantCommand, HoldingOperator, World, raises, recording
+from helpers_bus import START, ConstantCommand, HoldingOperator, World, raises, recording
 from helpers_faults import COMMAND, FAULTS, NOT_FOUND, delay, flood, freeze, measure
 from helpers_machines import obedient_net, pids
 
@@ -15,7 +15,7 @@ from brokk_min._files import SHIPPED
 from brokk_min.can.canopen import valve_frame
 from brokk_min.can.operator_input import Script
 from brokk_min.env import reward
-from brokk_min.evaluation.baselines import STRONGEST
+from brokk_min.evaluation.baselines import BY_HAND, STRONGEST
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_velocity
@@ -44,16 +44,13 @@ def test_import__loads_no_library_that_is_not_needed():
 
 
 def controller_of(name):
-    if name == "jacobian":
-        return BASELINE
-    if name == "strong":  # it has a memory, as our agent
-        return pids(BROKK_170, obedient_net(BROKK_170))[STRONGEST]
-    path = SHIPPED / BROKK_170.name / POLICIES[name]
-    return load_policy(path, BROKK_170)
+    if name in POLICIES:
+        return load_policy(SHIPPED / BROKK_170.name / POLICIES[name], BROKK_170)
+    return pids(BROKK_170, obedient_net(BROKK_170))[name]
 
 
 @pytest.mark.parametrize(
-    ("axis", "name"), [(2, "jacobian"), (0, "strong"), (1, "rl"), (0, "rl_paper")]
+    ("axis", "name"), [(2, BY_HAND), (0, STRONGEST), (1, "rl"), (0, "rl_paper")]
 )
 def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     """Within 0.2 %, with 2 ms of bus and machine between SYNC and valve frame."""
