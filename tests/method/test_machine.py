@@ -88,7 +88,7 @@ def test_a_machine_without_hydraulics__moves_as_fast_as_its_joints_say():
     """All numbers of the plant are optional; speeds come from q_dot_up and q_dot_down."""
     fields = {f.name for f in dataclasses.fields(Joint) if f.default is dataclasses.MISSING}
     joints = [Joint(**{name: getattr(j, name) for name in fields}) for j in BROKK_170.joints]
-    joints[2] = replace(joints[2], dead_zone=(0.1, 0.02))
+    joints[2] = replace(joints[2], dead_zone=(0.1, 0.02), cylinder_rod=0.5)
     given = {f.name for f in dataclasses.fields(Machine) if f.default is dataclasses.MISSING}
     machine = Machine(**{n: getattr(BROKK_170, n) for n in given} | {"joints": tuple(joints)})
     for sign, q_dot in ((1, machine.column("q_dot_up")), (-1, -machine.column("q_dot_down"))):
