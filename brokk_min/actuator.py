@@ -1,9 +1,8 @@
 """The actuators: an analytic plant that plays the hydraulics, and the nets that learn it from logs.
 
-Both are plants: they have `reset` and `step`, and either can move the machine. First comes the
-analytic one, whose equations no net and no policy sees; then the history, which holds angle,
-velocity and command of the last 13 samples; and last the nets, which read it.
-`identification.fitting` makes them from logs.
+Both are plants: they have `reset` and `step`, and either can move the machine. No net and no policy
+sees the equations of the analytic one. The nets read a history, which holds angle, velocity and
+command of the last 13 samples. `identification.fitting` makes nets from logs.
 """
 
 from collections.abc import Mapping
@@ -24,6 +23,9 @@ class Plant(Protocol):
 
     def step(self, machine: Machine, state: Any, u: Array) -> Any:
         """The state one tick later, under held commands u [-1, 1] (..., n)."""
+
+
+# --- the analytic plant ---------------------------------------------------------------------------
 
 
 class PlantState(NamedTuple):
@@ -67,6 +69,11 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
     """Distance from pivot to cylinder axis [m] at angles `q` [rad] (..., n). Paper: eq1 (r)
 
     r = a b sin(gamma) / sqrt(a^2 + b^2 - 2 a b cos(gamma)), gamma = gamma_0 + q.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> lever_arm(BROKK_170, [0.0, 0.5, 0.5, 1.7, 1.0]).round(3)
+        array([0.15 , 0.337, 0.299, 0.247, 0.197])
     """
     a, b = machine.column("cylinder_base"), machine.column("cylinder_rod")
     gamma = machine.column("cylinder_angle") + np.asarray(q)
@@ -94,6 +101,9 @@ def euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantStat
     at_bottom = (q_next <= m.column("q_min")) & (v_next < 0)
     v_next = np.where(at_top | at_bottom, 0.0, v_next)
     return PlantState(q_next, v_next, s_next, z_next, state.delayed)
+
+
+# --- the history ----------------------------------------------------------------------------------
 
 
 def initial_history(q: ArrayLike, samples: int) -> Array:
@@ -139,6 +149,9 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> Array:
     t = dt * (np.arange(samples) - (samples - 1) / 2)
     weights = (t / (t @ t)).astype(q.dtype)  # slope = sum t_i q_i / sum t_i^2
     return np.asarray(np.einsum("...t,t", q[..., -samples:], weights))
+
+
+# --- the nets -------------------------------------------------------------------------------------
 
 
 class NetState(NamedTuple):

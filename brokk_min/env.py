@@ -14,12 +14,17 @@ driven joints and 1 locked joint; its history has H = 13 samples.
 
 Observation: Box, float32, (163,): each number less its mean, over its deviation in the task, see
 `velocity_deviations`. The newest sample is last. Vectors are in the base frame.
+
 Action: Box(-1, 1, (4,)), of the largest command of each driven joint.
 Reward: 1 / (1 + |v_goal - v_tool|) (eq2).
 Start: at rest in a random pose, with a random goal that changes now and then.
 End: terminated, without reward, if the episode starts with a link in the ground; truncated after
 20 s.
+
+An `Interface` is what an agent reads, does and is paid for. The defaults are the paper's.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -79,11 +84,12 @@ def observation_table(machine: Machine) -> tuple[Array, Array, NDArray[np.bool_]
 def measure(
     machine: Machine, history: Array, v_goal: Array, noise: Array | float = 0.0
 ) -> Measured:
-    """Measurements from a history (..., n, 3, H) and a goal [m/s] (..., 3). Paper: Sec. 3.4, Fig. 3
+    """Measurements for training, evaluation and the machine. Paper: Sec. 3.4, Fig. 3
 
-    `noise` (..., noisy) is in deviations and is added to what sensors measure. It is new at each
-    tick for all samples of the history, old ones too. The tool's velocity has noise of its own
-    beside that of the angles in J.
+    From the measured history (..., n, 3, H) and the goal velocity [m/s] (..., 3). `noise` (...,
+    noisy) is in deviations and is added to what sensors measure. It is new at each tick for all
+    samples of the history, old ones too. The tool's velocity has noise of its own beside that of
+    the angles in J.
     """
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
@@ -97,8 +103,8 @@ def measure(
     return Measured(v_goal, v_tool, q, driven[..., 1, -1], driven)
 
 
-def features(machine: Machine, measured: Measured, memory: Any = None) -> Array:
-    """The observation of the table above; it needs no `memory`. Paper: Sec. 3.4, Fig. 3"""
+def features(machine: Machine, measured: Measured) -> Array:
+    """The observation of the table above. Paper: Sec. 3.4, Fig. 3"""
     shape = (*measured.q.shape[:-1], -1)
     angles_and_velocities = measured.history[..., :2, :].reshape(shape)
     u = measured.history[..., 2, :].reshape(shape)
@@ -108,10 +114,15 @@ def features(machine: Machine, measured: Measured, memory: Any = None) -> Array:
     return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / std
 
 
-def action_to_pwm(machine: Machine, action: ArrayLike, memory: Any = None) -> Array:
+def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
     """Commands u (..., n) of full command from actions of the driven joints (..., n_driven).
 
-    They need no `memory`. ValueError: a wrong shape, or a number that is not finite.
+    ValueError: a wrong shape, or a number that is not finite.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> action_to_pwm(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
+        array([ 80.,   0., -40.,   0.,  80.])
     """
     a = np.asarray(action)
     if a.shape[-1:] != machine.driven.shape or not np.isfinite(a).all():
@@ -123,19 +134,24 @@ def action_to_pwm(machine: Machine, action: ArrayLike, memory: Any = None) -> Ar
 
 @dataclass(frozen=True)
 class Interface:
-    """What an agent reads, does and is paid for, as functions; the defaults are the paper's.
+    """What an agent reads, does and is paid for; the defaults are the paper's.
 
     `memory` is what the agent keeps from tick to tick. At the start of an episode it is None; the
     paper's agent keeps nothing. Each tick calls `remember`, `observe` and `command`; after the
     transition `cost` gets the memory of the next tick. `learning.gym_env` takes the cost off eq2.
+    The fields are functions, not methods.
     """
 
     scale: Callable[[Machine], tuple[Array, Array]] = (  # mean, deviation
         lambda machine: observation_table(machine)[:2]
     )
     remember: Callable[[Machine, Any, Measured], Any] = lambda machine, memory, measured: None
-    observe: Callable[[Machine, Measured, Any], Array] = features
-    command: Callable[[Machine, Array, Any], Array] = action_to_pwm
+    observe: Callable[[Machine, Measured, Any], Array] = lambda machine, measured, memory: features(
+        machine, measured
+    )
+    command: Callable[[Machine, Array, Any], Array] = lambda machine, action, memory: action_to_pwm(
+        machine, action
+    )
     cost: Callable[[Machine, Array, Array, Any], Array | float] = (  # of u after u_before
         lambda machine, u, u_before, memory: 0.0
     )

@@ -18,10 +18,14 @@ from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, 
 def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False) -> Array:
     """Weighted damped least squares W^-1 J^T (J W^-1 J^T + lambda^2 I)^-1 [rad/m], (..., n, 3).
 
-    q_dot = dls(J, W, damping) @ v minimises |J q_dot - v|^2 + lambda^2 q_dot^T W q_dot, where `J`
-    is the Jacobian [m/rad] (..., 3, n), `W` the diagonal of the weights (..., n), positive, and
-    `damping` lambda^2 [m^2] (...), positive where J W^-1 J^T is singular. The paper prints J W J^T
-    in the bracket (`as_printed`). That is the minimiser only for W = I. Paper: eq4
+    q_dot = dls(J, W, damping) @ v minimises |J q_dot - v|^2 + lambda^2 q_dot^T W q_dot. The paper
+    prints J W J^T in the bracket. That is the minimiser only for W = I. Paper: eq4
+
+    Args:
+        J: Jacobian [m/rad], (..., 3, n).
+        W: diagonal of the weight matrix, (..., n), positive.
+        damping: lambda^2 [m^2], (...); must be positive where J W^-1 J^T is singular.
+        as_printed: use the paper's printed form.
     """
     J, W = np.asarray(J, float), np.asarray(W, float)
     W_inv = 1 / W[..., None, :]

@@ -9,8 +9,6 @@ Example:
     >>> x, y, z = tool_position(frames)
     >>> round(float(np.hypot(x, y)), 2), round(float(z), 2)
     (3.05, 1.01)
-    >>> tool_velocity(frames, [1.0, 0.0, 0.0, 0.0, 0.0]).round(2)
-    array([-3.04,  0.22,  0.  ])
 """
 
 import math
@@ -19,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.machine import Array, Machine, require
+from brokk_min.machine import Array, Machine
 
 
 class Frames(NamedTuple):
@@ -35,10 +33,12 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
 
     T_i = T_{i-1} Rz(theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i) (standard Denavit-Hartenberg), with
     theta_i + q_i for theta_i of a revolute joint and d_i + q_i for d_i of a prismatic one.
+
     ValueError: `q` has another number of joints.
     """
     q = 1.0 * np.asarray(q)  # whole numbers become floats
-    require(q.shape[-1:] == (machine.n,), "q", f"(..., {machine.n})", q.shape)
+    if q.shape[-1:] != (machine.n,):
+        raise ValueError(f"q: expected (..., {machine.n}), got {q.shape}")
     # The arrays in here have their axes reversed, so vectors are (3, ...) and c * x scales the
     # vector x of each pose; this takes half the time of (..., 3) at 256 poses.
     q = np.ascontiguousarray(q.T)
@@ -82,10 +82,23 @@ def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
     """Velocity J q_dot of the tool tip in the base frame [m/s], (..., 3).
 
     `q_dot` [rad/s or m/s] (..., n) is of all joints, locked ones included. Paper: Sec. 3.4
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> frames = forward_kinematics(BROKK_170, np.zeros(5))
+        >>> tool_velocity(frames, [1.0, 0.0, 0.0, 0.0, 0.0]).round(2) + 0.0
+        array([0.  , 2.35, 0.  ])
     """
     return np.asarray((jacobian(frames) @ np.asarray(q_dot)[..., None])[..., 0])  # v = J q_dot
 
 
 def lowest_point(frames: Frames) -> Array:
-    """Height of the lowest of the origins p_1 .. p_n, the ends of the links [m], (...)."""
+    """Height of the lowest of the origins p_1 .. p_n, the ends of the links [m], (...).
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> frames = forward_kinematics(BROKK_170, [0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])
+        >>> round(float(lowest_point(frames)), 2)
+        0.95
+    """
     return np.asarray(frames.p[..., 1:, 2].min(axis=-1))

@@ -215,10 +215,11 @@ def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
 
 
 def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
-    """Byte on the bus for a command `u` (...); ValueError: it is outside [-1, 1].
+    """Byte on the bus for a command `u` in [-1, 1] (...).
 
     With m = 127 u in whole counts: m >= 0 -> m, m < 0 -> 255 - |m|.
-    Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255)
+
+    Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255). ValueError: `u` outside [-1, 1].
 
     Example:
         >>> encode_pwm(np.array([80, -80, 50, -50, 0]) / 127).tolist()

@@ -2,13 +2,15 @@
 
 It trains on a Gymnasium vector environment with Box spaces that resets in the same step. A
 truncated episode did not fail: its return goes on with the value of its own last observation. At a
-termination it stops. Advantages come from a critic, as in the paper, or from another function.
+termination it stops. Advantages come from a critic, as in the paper; `train` also accepts another
+advantage function.
 Names follow CleanRL's where they can; target_kl steers the learning rate. Paper: Sec. 3.4
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,19 +21,19 @@ from torch import Tensor, nn
 from brokk_min.settings import PPOConfig
 
 
-def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
-    """256-128-64 with ELU and a linear output; weights orthogonal, biases 0. Paper: Sec. 3.4
+def layer_init(layer: nn.Linear, std: float) -> nn.Linear:
+    """Orthogonal weights with gain `std`, biases 0."""
+    nn.init.orthogonal_(layer.weight, std)
+    nn.init.zeros_(layer.bias)
+    return layer
 
-    The gain of the weights is sqrt(2), that of the output `std`.
-    """
-    sizes, gains = (inputs, 256, 128, 64, outputs), (*[math.sqrt(2)] * 3, std)
+
+def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
+    """256-128-64 with ELU and a linear output. Paper: Sec. 3.4"""
     layers: list[nn.Module] = []
-    for (size_in, size_out), gain in zip(pairwise(sizes), gains, strict=True):
-        layer = nn.Linear(size_in, size_out)
-        nn.init.orthogonal_(layer.weight, gain)
-        nn.init.zeros_(layer.bias)
-        layers += [layer, nn.ELU()]
-    return nn.Sequential(*layers[:-1])
+    for size_in, size_out in ((inputs, 256), (256, 128), (128, 64)):
+        layers += [layer_init(nn.Linear(size_in, size_out), math.sqrt(2)), nn.ELU()]
+    return nn.Sequential(*layers, layer_init(nn.Linear(64, outputs), std))
 
 
 class Agent(nn.Module):
@@ -69,7 +71,7 @@ class Rollout(NamedTuple):
     terminated: Tensor
     dones: Tensor  # terminated or truncated
     next_obs: Tensor  # where an episode ended: its own last observation
-    infos: tuple[dict[str, Any], ...]  # of `env.step`, tick by tick
+    infos: list[dict[str, Any]]  # of `env.step`, tick by tick
 
 
 class Checkpoint(NamedTuple):
@@ -82,7 +84,6 @@ class Checkpoint(NamedTuple):
     update: int
 
 
-# advantages (T, N) of a rollout, and the returns that the critic learns, or None
 Advantages = Callable[[Agent, Rollout, PPOConfig], tuple[Tensor, Tensor | None]]
 
 
@@ -98,7 +99,8 @@ def collect(
 ) -> tuple[Rollout, Tensor]:
     """`horizon` ticks of all environments from observations (num_envs, obs); and the next ones."""
     space: Any = env.single_action_space
-    ticks: list[tuple[Any, ...]] = []
+    ticks: list[tuple[Tensor, ...]] = []
+    infos = []
     for _ in range(horizon):
         mean = agent.actor(obs)
         action = mean + agent.log_std.exp() * torch.randn(mean.shape)
@@ -111,11 +113,12 @@ def collect(
         if done.any():
             last_obs[done] = torch.as_tensor(np.stack(info["final_obs"][done])).float()
         rewards = torch.as_tensor(reward).float()
-        ends = torch.as_tensor(terminated), torch.as_tensor(done)
-        ticks.append((obs, action, logprob, rewards, *ends, last_obs, info))
+        flags = torch.as_tensor(terminated), torch.as_tensor(done)
+        ticks.append((obs, action, logprob, rewards, *flags, last_obs))
+        infos.append(info)
         obs = following
-    *columns, infos = zip(*ticks, strict=True)
-    return Rollout._make([*map(torch.stack, columns), infos]), obs
+    tensors = [torch.stack(column) for column in zip(*ticks, strict=True)]
+    return Rollout(*tensors, infos=infos), obs  # type: ignore[misc, arg-type]
 
 
 def gae(
@@ -202,9 +205,10 @@ def train(
 ) -> Agent:
     """Train an agent; the same seed gives the same bits on the same machine.
 
-    `on_update` is called after each update, with the rollout and scalars under CleanRL's names.
-    `start` is a checkpoint to go on from, in place of a new agent by `seed`. ValueError: a loss
-    that is not finite.
+    `advantage_function` gives advantages (T, N) of a rollout, and the returns that the critic
+    learns, or None. `on_update` is called after each update, with the rollout and scalars under
+    CleanRL's names. `start` is a checkpoint to go on from, in place of a new agent by `seed`.
+    ValueError: a loss that is not finite.
     """
     agent, optimizer, obs, global_step, update = start or begin(env, config, seed)
     group = optimizer.param_groups[0]
@@ -246,7 +250,8 @@ def train(
         metrics = {f"losses/{name}": mean for name, mean in zip(names, means, strict=True)}
         metrics["charts/reward"] = float(rollout.rewards.mean())
         metrics["charts/learning_rate"] = group["lr"]
-        # as in rl_games: a lower rate after a large change of the policy, a higher after a small
+        # lower the rate after a large change of the policy, raise it after a small one, in the
+        # manner of rl_games
         if metrics["losses/approx_kl"] > 1.5 * config.target_kl:
             group["peak_lr"] /= 1.2
         elif metrics["losses/approx_kl"] < 0.7 * config.target_kl:
