@@ -121,8 +121,9 @@ def train(data: TrainingSet, config: FitConfig, seed: int) -> tuple[Array, ...]:
     for steps, rate, windows, batch, ticks in stages:
         for step in tqdm(range(steps), desc=f"fit nets, {ticks} ticks", unit="step", disable=None):
             optimizer.param_groups[0]["lr"] = 0.5 * rate * (1 + math.cos(math.pi * step / steps))
-            drawn = [at[torch.randint(len(at), (batch,), generator=generator)] for at in windows]
-            loss = accumulated_loss(data, weights, torch.tensor(np.stack(drawn, axis=1)), ticks)
+            rows = [torch.randint(len(at), (batch,), generator=generator) for at in windows]
+            drawn = [torch.from_numpy(at)[row] for at, row in zip(windows, rows, strict=True)]
+            loss = accumulated_loss(data, weights, torch.stack(drawn, dim=1), ticks)
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
@@ -148,12 +149,6 @@ def initial_weights(data: TrainingSet, config: FitConfig, generator: Generator) 
         weights += [w, torch.zeros(n, columns)]
     weights[0] *= data.reads[:, None]
     return [weight.requires_grad_() for weight in weights]
-
-
-def draw_windows(windows: list[Rows], batch: int, generator: Generator) -> Tensor:
-    """Newest samples (batch, n) of random windows of each joint."""
-    rows = [torch.randint(len(ends), (batch,), generator=generator).numpy() for ends in windows]
-    return torch.tensor(np.stack([ends[at] for ends, at in zip(windows, rows)], axis=1))
 
 
 def accumulated_loss(data: TrainingSet, weights: list[Tensor], at: Tensor, ticks: int) -> Tensor:
