@@ -1,11 +1,12 @@
 """The CAN bus through python-can, and its log; python-can is imported when a bus is opened."""
 
 import os
+import select
 import signal
 import time
 from collections import deque
 from collections.abc import Callable, Container, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ class Bus:
     name: str = "can"  # of the bus in the log
     log: Any = None  # path of a log in candump's format, or a file
     echo: bool = False  # does the bus give back what we send?
+    file: int = -1  # descriptor to wait on; -1: `bus` waits itself
     clock: Callable[[], float] = time.monotonic  # s
     sleep: Callable[[float], object] = time.sleep
     allowed: Container[int] = range(0x800)  # identifiers of frames that it sends
@@ -39,17 +41,19 @@ class Bus:
     def recv(self, timeout: float) -> Frame | None:
         """The next frame within `timeout` [s], or None."""
         end = self.clock() + timeout
-        message = self.bus.recv(timeout)
-        while message is None and (left := end - self.clock()) > 0:
-            message = self.bus.recv(left)  # its timeout follows the time of day, which may be set
+        message = self.bus.recv(timeout if self.file < 0 else 0.0)
+        # python-can's own timeout follows the time of day, so we wait for the descriptor
+        while message is None and self.file >= 0 and (left := end - self.clock()) > 0:
+            if select.select([self.file], [], [], left)[0]:
+                message = self.bus.recv(0.0)
         if message is None:
             return None
-        message.timestamp, message.channel = self.now(), self.name
+        message.timestamp = self.now()
         frame = plain_frame(message)
         if (frame.id, frame.data) in self.echoes:
             self.echoes.remove((frame.id, frame.data))
             return frame._replace(id=-1)
-        self.writer(message)
+        self._log(message, self.name)
         return frame
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -58,24 +62,29 @@ class Bus:
         A frame that is not `allowed` is in the log alone, with the identifier `WOULD_SEND`.
         """
         if can_id not in self.allowed:
-            self.writer(self._message(WOULD_SEND, data, "shadow"))
+            self._log(self._message(WOULD_SEND, data), "shadow")
             return
-        message = self._message(can_id, data, self.name)
+        message = self._message(can_id, data)
         self.bus.send(message, timeout=0.01)
         self.echoes.append((can_id, data))
-        self.writer(message)
+        self._log(message, self.name)
 
     def log_input(self, data: bytes) -> None:
         """Log the operator's input, which is not on the bus."""
-        self.writer(self._message(OPERATOR_INPUT, data, "operator"))
+        self._log(self._message(OPERATOR_INPUT, data), "operator")
 
     def flush(self) -> None:
         """Write the log on, so that it survives the program's sudden end. OSError: a full disk."""
         self.writer.file.flush()
 
-    def _message(self, can_id: int, data: bytes, channel: str) -> Any:
-        ours = {"is_extended_id": False, "is_rx": False, "timestamp": self.now()}
-        return self.can.Message(arbitration_id=can_id, data=data, channel=channel, **ours)
+    def _message(self, can_id: int, data: bytes) -> Any:
+        message = self.can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        message.is_rx, message.timestamp = False, self.now()
+        return message
+
+    def _log(self, message: Any, channel: str) -> None:
+        message.channel = channel  # only now, because some interfaces have channels of their own
+        self.writer(message)
 
     def close(self) -> None:
         """Close bus and log, the log even if the bus fails."""
@@ -102,8 +111,11 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         raw = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
         raise ValueError(f"{where}, got {brief(error)}") from error
+    bus = Bus(raw, channel, log, echo=interface == "udp_multicast")
+    with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
+        bus.file = raw.fileno()
     try:
-        with closing(Bus(raw, channel, log, echo=interface == "udp_multicast")) as bus:
+        with closing(bus):
             yield bus
     except can.CanError as error:
         raise ValueError(f"{where} that works, got {brief(error)}") from error

@@ -61,7 +61,7 @@ def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Teleme
     start = 0.0  # s, time of the last SYNC
     for frame in frames:
         nodes.update(frame)
-        if frame.id == canopen.OPERATOR_INPUT and frame.sent:
+        if frame.id == canopen.OPERATOR_INPUT and frame.sent and len(frame.data) == 7:
             v_goal = np.array(struct.unpack_from("<hhh", frame.data)) / 1e4
         elif frame.id == canopen.SYNC:
             if (nodes.frames == 1).all():

@@ -101,5 +101,7 @@ class JointJog:
 
     def __call__(self, measured: Measured, state: None) -> tuple[Array, None]:
         """Commands u (..., n)."""
+        v_x = measured.v_goal[..., :1]
+        side = np.sign(v_x) * (np.abs(v_x) > 0.1 * self.machine.tool_speed)
         chosen = np.array(self.machine.names) == self.joint
-        return np.sign(measured.v_goal[..., :1]) * chosen * self.counts / PWM_MAX, None
+        return side * chosen * self.counts / PWM_MAX, None

@@ -15,7 +15,7 @@ from brokk_min.can.simulated_machine import start_pose
 from brokk_min.env import initial_state, measure, transition
 from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine, require
+from brokk_min.machine import Array, Machine
 from brokk_min.viewer.drawing import Scene, draw
 
 SIZE = (1120, 680)  # px, of the window
@@ -23,6 +23,7 @@ TRAIL = 600  # positions of the tool that are shown
 # keys for and against x, y and z, as the top view shows them, and axes of a gamepad for them
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
 AXES = (1, 0, 3)
+UNSEEN = "SDL_VIDEODRIVER=dummy draws unseen"
 HELP = "arrows, W, S: move    left SHIFT: slowly    TAB: the other controller    ESC: end"
 
 
@@ -83,31 +84,32 @@ class Session:
 def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PLANT) -> None:
     """Drive a simulated machine in a window, until it is closed; ValueError: no display."""
     pygame = require_package("pygame", "play")
-    window = open_window(pygame)
-    session, operator = Session(machine, controllers, plant), Operator(machine, pygame)
-    clock = pygame.time.Clock()
-    while True:
-        for event in pygame.event.get():
-            key = operator.handle(event)
-            if key == "escape":
-                pygame.display.quit()
-                return
-            if key == "tab":
-                session.switch()
-        scene = session.tick(operator.velocity())
-        pixels = draw(machine, scene, SIZE).tobytes()
-        window.blit(pygame.image.frombytes(pixels, SIZE, "RGB"), (0, 0))
-        pygame.display.flip()
-        clock.tick(machine.rate)
+    try:
+        window, clock = open_window(pygame), pygame.time.Clock()
+        session, operator = Session(machine, controllers, plant), Operator(machine, pygame)
+        while True:
+            for event in pygame.event.get():
+                key = operator.handle(event)
+                if key == "escape":
+                    return
+                if key == "tab":
+                    session.switch()
+            scene = session.tick(operator.velocity())
+            pixels = draw(machine, scene, SIZE).tobytes()
+            window.blit(pygame.image.frombytes(pixels, SIZE, "RGB"), (0, 0))
+            pygame.display.flip()
+            clock.tick(machine.rate)
+    except pygame.error as error:
+        raise ValueError(f"window: expected a display ({UNSEEN}), got {error}") from error
+    finally:
+        pygame.display.quit()
 
 
 def open_window(pygame: Any) -> Any:
-    """A new window; without a display SDL would draw unseen, if SDL_VIDEODRIVER asks for it."""
-    try:
-        window = pygame.display.set_mode(SIZE)
-    except pygame.error as error:
-        raise ValueError(f"window: expected a display, got {error}") from error
+    """A new window. Without a display SDL draws unseen: refused unless SDL_VIDEODRIVER is set."""
+    window = pygame.display.set_mode(SIZE)
     unseen = pygame.display.get_driver() in ("offscreen", "dummy")
-    require(not unseen or "SDL_VIDEODRIVER" in os.environ, "window", "a display", "none")
+    if unseen and "SDL_VIDEODRIVER" not in os.environ:
+        raise pygame.error("none")
     pygame.display.set_caption(f"brokk_min: {HELP}")
     return window

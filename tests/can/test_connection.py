@@ -1,7 +1,11 @@
 """The bus through python-can: waiting, echoes, refusals, and the log."""
 
 import io
+import os
 import re
+import select
+import threading
+import time
 from functools import partial
 from types import SimpleNamespace
 
@@ -49,11 +53,21 @@ def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
     assert (tmp_path / "l").read_text().endswith(" v 080# T\n")
 
 
-def test_recv__waits_by_its_own_clock():
-    """The time of day is set forward: python-can gives up at once, three times."""
-    message = can.Message(arbitration_id=0x181, data=b"1234", is_extended_id=False)
-    answers, times = iter([None, None, None, message]), iter([0.0, 0.0, 0.1, 0.2, 0.3, 0.4])
-    bus = Bus(SimpleNamespace(recv=lambda timeout: next(answers)), clock=lambda: next(times))
-    assert bus.recv(0.5).id == 0x181
-    times, answers = iter([0.0, 0.6]), iter([None])
-    assert bus.recv(0.5) is None
+def test_recv__waits_for_the_descriptor_by_its_own_clock():
+    """A frame comes with the byte of a pipe."""
+    reader, writer = os.pipe()
+
+    def recv(timeout):
+        assert timeout == 0.0  # else python-can would wait by the time of day
+        if not select.select([reader], [], [], 0)[0]:
+            return None
+        os.read(reader, 1)
+        return can.Message(arbitration_id=0x181, data=b"1234", is_extended_id=False)
+
+    bus = Bus(SimpleNamespace(recv=recv), file=reader)
+    start = time.monotonic()
+    assert bus.recv(0.05) is None and 0.05 <= time.monotonic() - start < 1.0
+    threading.Timer(0.02, os.write, (writer, b"x")).start()
+    frame = bus.recv(5.0)
+    assert (frame.id, frame.data) == (0x181, b"1234") and time.monotonic() - start < 2.0
+    os.close(reader), os.close(writer)
