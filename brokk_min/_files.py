@@ -8,7 +8,7 @@ import csv
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
@@ -37,6 +37,7 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
 
     It has the mode of the file that it replaces. ValueError: `path` is a folder or a device.
     """
+    path = Path(path)
     require(path.is_file() or not path.exists(), str(path), "a regular file", "another kind")
     target = path.resolve()  # of a link
     temporary = target.with_name(f".{target.name[:100]}.{os.getpid()}")
@@ -49,7 +50,8 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -81,8 +83,8 @@ def brief(value: Any, longest: int = 110) -> str:
 def expected(path: Path, what: str) -> Iterator[None]:
     """Turn any error of the block into a ValueError: `path` is not `what`.
 
-    OSError and MemoryError stay as they are. One that says what was expected only gets `path` in
-    front of it.
+    OSError and MemoryError stay as they are. An error that says what was expected only gets `path`
+    in front of it.
     """
     try:
         yield
@@ -114,15 +116,21 @@ def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
         return {name: np.array(cells) for name, cells in zip(names, zip(*rows))}
 
 
-def numbers(path: Path, name: str, cells: Iterable[str]) -> NDArray[Any]:
-    """Cells of a column as numbers; ValueError: the row of one that is none."""
+def numbers(
+    path: Path,
+    name: str,
+    cells: Iterable[str],
+    number_of: Callable[[str], Any] = float,
+    what: str = "a number",
+) -> NDArray[Any]:
+    """Cells of a column as numbers; ValueError: the row of one that is not `what` it should be."""
     result = []
     for row, cell in enumerate(cells, 2):
         try:
-            result.append(float(cell))
+            result.append(number_of(str(cell)))
         except ValueError:
             place = f"{path}: row {row}, column {name}"
-            raise ValueError(f"{place}: expected a number, got {brief(str(cell))}") from None
+            raise ValueError(f"{place}: expected {what}, got {brief(str(cell))}") from None
     return np.array(result)
 
 

@@ -221,10 +221,11 @@ class ActuatorNet:
 
         The nets are those of the driven joints; the others stand.
         """
-        driven, u = machine.driven, u[..., machine.driven]
+        driven = machine.driven
         low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]
-        velocity = self.predict(append_command(state.history, u))
+        velocity = self.predict(append_command(state.history, u[..., driven]))
         q = state.q.copy()
         q[..., driven] = np.clip(q[..., driven] + machine.dt * velocity, low, high)
-        window = self.velocity_samples, machine.dt
-        return NetState(q, append_sample(state.history, u, q[..., driven], *window))
+        sent, reached = u[..., driven], q[..., driven]
+        window = self.velocity_samples
+        return NetState(q, append_sample(state.history, sent, reached, window, machine.dt))

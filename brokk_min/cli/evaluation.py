@@ -41,8 +41,9 @@ class Evaluate(Command):
         runs, _ = metrics.evaluate(machine, controllers, *self.task(machine), self.seed, plant)
         runs = [run | {"kind": "file"} for run in runs] if self.starts else runs
         if self.json:
-            meta = {option: str(value) for option, value in vars(self).items()}
-            meta |= {"policy": str(path), "gains": str(gains or "tuned now")}
+            meta = {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
+            meta["commands"] = str(self.commands or "own")
+            meta["starts"] = str(self.starts or self.num_starts)
             meta |= metrics.metadata(machine, self.seed)
             write_json(self.json, {"meta": meta, "runs": runs})
         print(table(runs))

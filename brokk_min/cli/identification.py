@@ -4,11 +4,12 @@ What fits or searches is imported by the command that runs it, because help must
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
 from brokk_min._files import expected, write_json
@@ -84,7 +85,9 @@ class Inspect(ReadsLogs):
         reports = inspection.inspect(log)
         warnings, scores = [*inspection.warnings(log, reports, known)], {}
         if self.net:
-            net = load_net(self.net)
+            net, window = load_net(self.net), machine.velocity_samples
+            wanted, got = f"velocity_samples {window} of --machine", net.velocity_samples
+            require(got == window, str(self.net), wanted, got)
             scores = validation.score(net, logs.in_order(log, net.joints))
         print(f"{len(log.recordings)} recordings", *inspection.table(reports), sep="\n")
         print_scores(scores, warnings)
@@ -101,20 +104,31 @@ class Fit(ReadsLogs):
     seed: int = 0  # Of the weights and the drawn windows.
     settings: OmitArgPrefixes[FitConfig]
 
+    @classmethod
+    def defaults(cls, options: list[str]) -> Any:
+        """Ours, or the settings of the paper's recipe."""
+        recipe, required = PAPER_RECIPE if "--paper" in options else {}, tyro.MISSING
+        recipe = recipe | ({"members": 1} if "--no-valve" in options else {})
+        return cls(logs=required, out=required, settings=FitConfig(**recipe))
+
     def __call__(self, machine: Machine) -> None:
         from brokk_min.identification import fitting, inspection, validation
 
-        check_settings(self.settings)
-        settings = replace(self.settings, **PAPER_RECIPE) if self.paper else self.settings
+        settings = self.settings
+        check_settings(settings)
+        fits = settings.valve or settings.members == 1
+        check(fits, "--members", "1 of nets that read the commands", settings.members)
+        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs, machine)
         if self.test:
-            test = logs.in_order(self.read_logs(self.test, machine)[0], log.joints)
+            with expected(self.test[0], "a log of the same joints"):
+                test = logs.in_order(self.read_logs(self.test, machine)[0], log.joints)
         else:
             log, test = logs.split(log)
         reports = inspection.inspect(log)
         for wrong in inspection.wrong_signs(reports):
-            raise ValueError(wrong)
+            raise ValueError(f"{self.logs[0]}: {wrong}")
         name = known.name if known else ""
         net = fitting.fit(log, settings, self.seed, machine, name)
         scores = validation.score(net, test)

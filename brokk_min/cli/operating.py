@@ -54,6 +54,7 @@ class Drive(Command):
 
     def __call__(self, machine: Machine) -> None:
         self.writes(self.log)
+        check(self.shadow or not self.sync, "--sync", "--shadow with it", "a drive that sends SYNC")
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         with open_bus(self.interface, self.channel, self.log) as bus:
             if self.shadow:
@@ -104,8 +105,8 @@ def status(drive: hw.Drive) -> str:
     if active not in drive.reason:
         words.append(f"now {active}")  # what is in the way
     if isinstance(drive.operator, Joystick) and any(v_goal) and not driving:
-        axes = [axis for axis, v in zip(drive.operator.axes, v_goal) if v]
-        words.append(f"the stick is not centred: axis {axes}")
+        axes = [str(axis) for axis, v in zip(drive.operator.axes, v_goal) if v]
+        words.append("the stick is not centred: axis " + " and ".join(axes))
     vectors: dict[str, Any] = {"v goal": v_goal}
     if measured := drive.measured:
         vectors |= {"measured": measured.v_tool[0], "q": measured.q[0]}
@@ -142,6 +143,7 @@ class Replay(Command):
         from brokk_min.viewer.replay import film
 
         self.writes(self.out)
+        check(self.out.suffix == ".gif", "--out", "a name in .gif", self.out)
         film(self.log, machine, self.out)
 
 

@@ -60,7 +60,9 @@ class Command:
     def writes(self, *paths: Path | None) -> None:
         """WrongUse: a file that cannot be written, or that exists without --force."""
         for path in filter(None, paths):
-            check(os.access(path.parent, os.W_OK), str(path), "a file in a writable folder", "none")
+            folder = path.parent
+            fits = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
+            check(fits, str(path), "a file in an existing, writable folder", "none")
             check(self.force or not path.exists(), str(path), "no file (or --force)", "one")
 
 
@@ -69,9 +71,15 @@ def load_object(option: str, name: str) -> Any:
     path, _, symbol = name.rpartition(":")
     known = "analytic" if option == "--plant" else BROKK_170.name
     check(path.endswith(".py"), option, f"{known} or FILE.py:NAME", name)
-    sys.path.insert(0, str(Path(path).resolve().parent))  # files beside it can be imported
-    with expected(Path(path), "a file that runs"):
+    folder = str(Path(path).resolve().parent)
+    sys.path.insert(0, folder)  # files beside it can be imported
+    try:
         found = runpy.run_path(path)
+    except (Exception, SystemExit) as error:  # whatever the file does
+        raise ValueError(f"{option}: expected {path} to run, got {brief(error)}") from error
+    finally:
+        sys.path.remove(folder)
+        sys.path.append(folder)  # also later, but in place of no package
     check(symbol in found, option, f"an object {symbol} in {path}", "none")
     return found[symbol]
 

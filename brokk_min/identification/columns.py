@@ -6,7 +6,7 @@ changes its sign.
 """
 
 import math
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from brokk_min.identification.ros_logs import read_ros
 from brokk_min.machine import Array, require
 
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
-UNITS |= {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # beside folders of ROS
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
 LARGEST = 1e12  # of numbers in a log, assumed: any time, angle or velocity
@@ -31,12 +31,13 @@ def parse_map(text: str) -> Mapped:
         name, _, source = map(str.strip, part.partition("="))
         column, _, unit = source.rpartition(":") if ":" in source else (source, "", "1")
         of_log = name if name in ("run", "time") or name[:2] in ("u_", "q_") else f"q_{name}"
+        units = TIMES if name == "time" else UNITS
         try:
-            factor = UNITS.get(unit) or float(unit)
+            factor = units.get(unit) or float(unit)
         except ValueError:
             factor = 0.0
         fits = bool(name and column and factor) and of_log not in result
-        wanted = f"NAME=COLUMN or NAME=COLUMN:UNIT once, a unit of {', '.join(UNITS)}, or a number"
+        wanted = f"NAME=COLUMN or NAME=COLUMN:UNIT once, a unit of {', '.join(units)}, or a number"
         require(fits, "--map", wanted, repr(part))
         result[of_log] = (column, factor)
     return result
@@ -67,6 +68,8 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
     for name in names:
         column, factor = sources[name]
         result[name] = _numbers(path, name, np.ravel(table[column]), factor)
+        rows, got = len(result["time"]), len(result[name])
+        require(got == rows, f"column {name}", f"{rows} numbers, as many as of time", got)
     column, _ = sources.get("run", ("run", 1.0))
     run = np.asarray(table.get(column, path.stem)).astype(str)
     return {"run": np.broadcast_to(run, len(result["time"]))} | result
@@ -76,17 +79,24 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
     """A column in the units of the log; ValueError: the row of what cannot be a value."""
     if values.dtype.kind == "M":
         values = (values - values[:1]) / np.timedelta64(1, "s")
-    elif name == "time" and ":" in str(values[:1]):  # ISO stamps
-        stamps = [datetime.fromisoformat(str(value).strip()) for value in values]
-        values = np.array([(stamp - stamps[0]).total_seconds() for stamp in stamps])
+    elif name == "time" and values.dtype.kind in "US" and ":" in values[0]:
+        moments = numbers(path, name, values, _moment, "an ISO stamp")
+        values = (moments - moments[0]) / timedelta(seconds=1)
     elif values.dtype.kind in "US":
         values = numbers(path, name, values)
     if name == "time" and factor != 1:
         values = values - values[:1]  # keeps its digits
     result: Array = np.asarray(values * factor, float)
-    limit = 1.0 if name.startswith("u_") else LARGEST
+    command = name.startswith("u_")
+    limit = 1.0 if command else LARGEST
     for row in np.flatnonzero(~(np.abs(result) <= limit)):  # also where it is nan
-        unit = f" (per cent: --map {name}=COLUMN:percent)" if limit == 1.0 else ""
+        unit = f" (per cent: --map {name}=COLUMN:percent)" if command else ""
         wanted = f"-{limit:g} to {limit:g}{unit}"
         raise ValueError(f"row {row + 2}, column {name}: expected {wanted}, got {result[row]}")
     return result
+
+
+def _moment(stamp: str) -> datetime:
+    """An ISO stamp, which is UTC if it names no zone."""
+    time = datetime.fromisoformat(stamp.strip())
+    return time if time.tzinfo else time.replace(tzinfo=UTC)

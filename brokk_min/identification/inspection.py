@@ -11,7 +11,7 @@ recorded range do not count, because a joint that is pushed against its stop sta
 
 from collections.abc import Iterator, Mapping
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ ZONES = 0.01 * np.arange(61)  # dead zones, of full command
 AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
 PAUSE = 2.0  # s, after so long a joint without commands is at rest
 CLEAR_SIGN = 0.1  # least correlation that has a clear sign
+OPPOSITE = 0.4  # least correlation of a recording with the other sign
 FASTEST = 0.999  # quantile of the speeds, because the single ones have noise
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
@@ -42,11 +43,11 @@ FOLLOWS = 0.8  # of a joint's motion without commands, that another joint explai
 class JointReport(NamedTuple):
     """One joint of a log; pairs are up and down."""
 
-    minutes: float  # in recordings in which it is driven
+    minutes: float  # in recordings in which it has commands
     low: float  # rad, smallest angle
     high: float  # rad
     fastest: tuple[float, float]  # rad/s, of the velocities in the log
-    opposite: list[str]  # recordings in which it falls under positive commands
+    opposite: list[str]  # recordings in which it moves against the model of all of them
     follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
     sign: int  # of the velocity under a positive command; 0: not clear
     explained: float  # part of the velocities' power that the model explains
@@ -62,16 +63,20 @@ def inspect(log: Log) -> dict[str, JointReport]:
         if recordings:
             rows = samples.moves[:, j]
             u, q, q_dot = (x[rows, j] for x in (samples.u, samples.q, samples.q_dot))
-            signs = [sign(one.u[:, j], one.q_dot[:, j], log.rate) for one in recordings]
+            each = [(one.name, motion_of([one], j, log.rate)) for one in recordings]
+            model = fit_model(motion_of(recordings, j, log.rate))
+            ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > logs.COMMANDED)
             reports[name] = JointReport(
-                minutes=len(q) / log.rate / 60,
+                minutes=ticks / log.rate / 60,
                 low=q.min(),
                 high=q.max(),
                 fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
-                opposite=[one.name for one, s in zip(recordings, signs, strict=True) if s < 0],
+                opposite=[run for run, motion in each if contradicts(motion, model)],
                 follows=followed_joints(log, samples, j),
                 sign=sign(u, q_dot, log.rate),
-                **fit_model(motion_of(recordings, j, log.rate)),
+                explained=model.explained,
+                delay=model.lag[0] / log.rate,
+                dead_zone=(model.zones[0], model.zones[1]),
             )
     return reports
 
@@ -120,38 +125,63 @@ def motion_of(recordings: list[Recording], j: int, rate: float) -> Motion:
     return Motion(u, (q_next - q) * rate * counts, counts, rate)
 
 
-def fit_model(motion: Motion) -> dict[str, Any]:
-    """The model's fields of `JointReport`: a grid of delays and lags, then one of dead zones."""
+class Model(NamedTuple):
+    """The model that explains a joint's motion best."""
+
+    explained: float  # part of the velocities' power
+    lag: tuple[int, float]  # delay [samples] and tau [s]
+    zones: Array  # dead zones up and down, of full command, (2,)
+    gains: Array  # rad/s per command beyond them, (2,)
+
+
+def fit_model(motion: Motion) -> Model:
+    """A grid of delays and lags, then one of dead zones, twice."""
     lags = list(product(range(round(LATEST * motion.rate) + 1), TAUS))
     zones = np.array([0.05, 0.05])
     for _ in range(2):
-        lag = min(lags, key=lambda lag: unexplained(motion, lag, zones))
+        best = max((with_gains(motion, lag, zones) for lag in lags), key=lambda one: one.explained)
         for side in (0, 1):
             trials = [np.where(np.arange(2) == side, zone, zones) for zone in ZONES]
-            zones = min(trials, key=lambda trial: unexplained(motion, lag, trial))
-    explained, delay = 1 - unexplained(motion, lag, zones), lag[0] / motion.rate
-    return {"explained": explained, "delay": delay, "dead_zone": tuple(zones)}
+            models = (with_gains(motion, best.lag, trial) for trial in trials)
+            best = max(models, key=lambda one: one.explained)
+            zones = best.zones
+    return best
 
 
-def unexplained(motion: Motion, lag: tuple[int, float], zones: Array) -> float:
-    """The part of the velocities' power that is not in the model with the best gains."""
+def with_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> Model:
+    """The model with the best gains; without motion it explains nothing."""
+    x = responses(motion, lag, zones)[:, motion.counts]
+    velocity = motion.velocity[motion.counts]
+    gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
+    error, power = velocity - gains @ x, float(velocity @ velocity)
+    explained = 1 - float(error @ error) / power if power else 0.0
+    return Model(explained, lag, zones, gains)
+
+
+def responses(motion: Motion, lag: tuple[int, float], zones: Array) -> Array:
+    """Velocities (2, T) upwards and downwards if the gains are 1."""
     (delay, tau), (up, down) = lag, zones
     late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
     openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
     a = np.exp(-1 / (motion.rate * tau))
-    x = lfilter([1 - a], [1, -a], openings)[:, motion.counts]  # velocities if the gains are 1
-    velocity = motion.velocity[motion.counts]
-    gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
-    error, power = velocity - gains @ x, float(velocity @ velocity)
-    return float(error @ error) / power if power else 1.0
+    return np.asarray(lfilter([1 - a], [1, -a], openings))
+
+
+def contradicts(motion: Motion, model: Model) -> bool:
+    """Does a joint move against what the model expects of its commands?"""
+    expected = model.gains @ responses(motion, model.lag, model.zones)
+    size = np.linalg.norm(expected) * np.linalg.norm(motion.velocity)
+    return bool(expected @ motion.velocity < -OPPOSITE * size)
 
 
 def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
-    """Joints whose angle falls under positive commands, in words."""
+    """Joints whose angle falls under positive commands in all recordings or in some, in words."""
     for name, report in reports.items():
+        wanted = f"u_{name}: expected positive commands to raise q_{name}"
+        if report.sign < 0:
+            yield f"{wanted}, got falling angles (--map {name}=COLUMN:-1)"
         if report.opposite:
-            got = f"falling angles in {brief(report.opposite)} (--map {name}=COLUMN:-1)"
-            yield f"u_{name}: expected positive commands to raise q_{name}, got {got}"
+            yield f"{wanted} in all recordings or in none, got some in {brief(report.opposite)}"
 
 
 def warnings(

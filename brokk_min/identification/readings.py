@@ -76,8 +76,9 @@ def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str
     period = np.median(step) * rows  # s, of new angles
     slow = [name for name, dt in zip(joints, period, strict=True) if dt > 1.05 / rate]
     wanted = f"new angles at the machine's {rate:g} Hz or more (if in ms: --map time=COLUMN:ms)"
-    got = f"one every {rows.max():g} rows: {1 / period.max():.3g} Hz"
-    require(not slow, f"run {run}, q of {brief(slow)}", wanted, got)
+    sensors = f"q of {brief(slow)}, one every {rows.max():g} rows"
+    where = sensors if rows.max() > 1 else "column time"
+    require(not slow, f"run {run}, {where}", wanted, f"{1 / period.max():.3g} Hz")
 
 
 def pieces_of(
@@ -102,5 +103,6 @@ def left_out(wrong: NDArray[np.bool_], q: Array, joints: Sequence[str]) -> Itera
     for name, bad, angle in zip(joints, wrong.T, q.T, strict=True):
         if bad.any():
             row = bad.argmax()
-            got = f"a jump to {angle[row]:.4g}: left out, or a new recording (rows: {bad.sum()})"
-            yield f"row {row + 2}: expected motion of q_{name}, got {got}"
+            got = f"a jump to {angle[row]:.4g} (was the sensor not read?) in {bad.sum()} rows"
+            what = "which are left out or begin a new recording"
+            yield f"row {row + 2}: expected motion of q_{name}, got {got}, {what}"

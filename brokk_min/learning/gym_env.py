@@ -76,7 +76,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     ) -> tuple[Array, dict[str, Any]]:
         """Draw new episodes for all machines, or where the option `reset_mask` is true."""
         super().reset(seed=seed)
-        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
+        mask = (options or {}).get("reset_mask")
+        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
         fits = mask.shape == (self.num_envs,) and mask.dtype == bool
         require(fits, "reset_mask", f"{self.num_envs} booleans", f"{mask.dtype} {mask.shape}")
         self.begin_episodes(mask)

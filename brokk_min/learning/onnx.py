@@ -13,7 +13,9 @@ OBSERVATION = (
     "each number less mean, over scale, newest samples last: goal and measured velocity of the "
     "tool [m/s], angles of locked joints [rad or m]; interface paper: histories of angles and of "
     "velocities of each driven joint, then of its command for each driven joint [of full command]; "
-    "interface beyond: the second table of brokk_min/beyond/interface.py"
+    "interface beyond: smoothed angles of driven joints, newer halves of the histories of their "
+    "velocities, then commands, then open indicators, resolved velocities of goal and integral, "
+    "see brokk_min/beyond/interface.py"
 )
 
 

@@ -67,7 +67,7 @@ def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys)
     log = foreign_log(tmp_path / "log.csv", 0, 2, sign=-1)
     assert run(f"fit {TINY}", log, "--out", tmp_path / "n.npz") == 1
     reversed_one = "u_arm: expected positive commands to raise q_arm"
-    assert reversed_one in capsys.readouterr().err
+    assert f"log.csv: {reversed_one}" in capsys.readouterr().err
     assert not (tmp_path / "n.npz").exists()
     assert run("inspect", log) == 0
     assert f"warning: {reversed_one}" in capsys.readouterr().out
@@ -89,6 +89,17 @@ def test_fit__knows_the_machine_of_a_log_and_the_papers_recipe(tmp_path, capsys)
         assert (net.machine, isinstance(net, ValveNet)) == (machine, valve)
         assert net.training["settings"]["rollout"] == (1 if "paper" in options else 8)
         assert log != own or net.joints == BROKK_170.names  # in the order of the machine
+    slow = tmp_path / "slow.py"
+    slow.write_text(
+        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
+        "SLOW = replace(BROKK_170, name='slow', rate=10.0, velocity_samples=3, history=6)\n"
+    )
+    assert run(f"fit --force {TINY} --rollout 1 --machine {slow}:SLOW", own, "--out", out) == 0
+    net = load_net(out)
+    expected = ("slow", 10.0, 3, 6)
+    assert (net.machine, net.rate, net.velocity_samples, net.history) == expected
+    assert run("inspect --net", out, own) == 1  # as a log of the default machine
+    assert "n.npz: expected velocity_samples 4 of --machine, got 3" in capsys.readouterr().err
 
 
 def test_collect__records_what_read_log_reads(tmp_path):

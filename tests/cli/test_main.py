@@ -85,13 +85,16 @@ VIRTUAL = "drive --interface virtual --channel v"
     [
         ("nonsense", 2, "replay, export, got 'nonsense'"),
         ("collect --out x.txt", 2, "--out: expected a name in .csv or .npz, got x.txt"),
-        ("collect --out none/x.csv", 2, "none/x.csv: expected a file in a writable folder"),
+        ("collect --out none/x.csv", 2, "none/x.csv: expected a file in an existing, writable"),
         ("collect --out x.csv --hours 0", 2, "--hours: expected above 0, to 100, got 0.0"),
         ("collect --out x.csv --seed -1", 1, "expected non-negative integer"),
         ("collect --out x.csv --machine digger", 2, "--machine: expected brokk170 or FILE.py"),
         ("inspect", 2, "LOGS: expected one file or more, got none"),
         ("inspect drive.log --map q1=boom:deg", 1, "--map: expected a table or a recording"),
         ("fit missing.csv --out n.npz", 1, "missing.csv: no such file or directory"),
+        ("fit l.csv --out n.npz --no-valve --members 3", 2, "--members: expected 1 of nets"),
+        ("fit l.csv --out n.npz --paper --members 3", 2, "--members: expected 1 of nets"),
+        ("fit l.csv --out n.npz --seed -1", 2, "--seed: expected 0 or more, got -1"),
         ("fit l.csv --out n.npz --batch-size 0", 2, "--batch-size: expected a positive number"),
         (f"{TRAIN} --seed -1", 2, "--seed: expected 0 or more, got -1"),
         (f"{TRAIN} --zero-goals 2.5", 2, "--zero-goals: expected 0 to 1, got 2.5"),
@@ -104,6 +107,8 @@ VIRTUAL = "drive --interface virtual --channel v"
         ("machine --interface nonsense --channel 0", 1, "nonsense 0: expected a CAN bus, got"),
         (f"{VIRTUAL} --controller jog --joint q2", 2, "--joint: expected one of ['q1', 'q3',"),
         (f"{VIRTUAL} --controller jog --joint q1", 1, "joystick: expected one, or --command FILE"),
+        (f"{VIRTUAL} --sync", 2, "--sync: expected --shadow with it, got a drive that sends SYNC"),
+        ("replay run.log --out a.mp4", 2, "--out: expected a name in .gif, got a.mp4"),
     ],
 )
 def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):

@@ -35,7 +35,7 @@ def test_status__names_the_axis_of_a_stick_that_is_not_centred():
     world = World(BASELINE, Joystick(BROKK_170))
     world.drive.begin()
     world.run(0.2)
-    assert "ready, the stick is not centred: axis [4], v goal +0.00 +0.00 +0.30" in status(
+    assert "ready, the stick is not centred: axis 4, v goal +0.00 +0.00 +0.30" in status(
         world.drive
     )
     device.unplug()

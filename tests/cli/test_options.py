@@ -47,7 +47,10 @@ def test_find_machine__takes_a_name_or_an_object_of_a_file(file):
     with pytest.raises(WrongUse, match=r"--machine: expected an object NONE in .*, got none"):
         Command(machine=f"{file}:NONE").find_machine()
     file.write_text("1 / 0")
-    with pytest.raises(ValueError, match=r"own.py: expected a file that runs, got division by"):
+    with pytest.raises(ValueError, match=r"--machine: expected .* to run, got division by zero"):
+        Command(machine=f"{file}:DIGGER").find_machine()
+    file.write_text("raise SystemExit(0)")
+    with pytest.raises(ValueError, match=r"--machine: expected .* to run, got SystemExit"):
         Command(machine=f"{file}:DIGGER").find_machine()
 
 

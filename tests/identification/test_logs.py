@@ -136,8 +136,8 @@ def test_read_log__leaves_out_readings_that_no_motion_explains(tmp_path, wrong, 
     np.testing.assert_allclose(log.recordings[0].u, sound.recordings[0].u[1:-1], atol=1e-12)
     assert (speed_of(log) < speed_of(sound) + 0.05).all()
     assert len(log.warnings) == 2
-    told = f"log.npz: row 2: expected motion of q_a, got a jump to {wrong:.4g}: left out, "
-    assert told in log.warnings[0] and log.warnings[0].endswith("(rows: 4)")
+    told = f"log.npz: row 2: expected motion of q_a, got a jump to {wrong:.4g} (was the "
+    assert told in log.warnings[0] and " in 4 rows, which are left out" in log.warnings[0]
     assert "log.npz: row 62: expected motion of q_b" in log.warnings[1]
 
 
@@ -164,8 +164,8 @@ def test_read_log__refuses_a_sensor_that_is_slower_than_the_rows(tmp_path, every
     """Only the moving joint's values repeat; a parked joint repeats its value anyway."""
     columns = swinging()
     columns["q_a"] = columns["q_a"][np.arange(400) // every * every]
-    wanted, got = "expected new angles at the machine's 20 Hz.*", f"got one every {every} rows"
-    with pytest.raises(ValueError, match=rf"run x, q of \['a'\]: {wanted}, {got}"):
+    wanted, got = "expected new angles at the machine's 20 Hz.*", f"got {20 / every:.3g} Hz"
+    with pytest.raises(ValueError, match=rf"q of \['a'\], one every {every} rows: {wanted}, {got}"):
         read_columns(tmp_path, columns)
     fast = swinging(rate=20.0 * every)
     fast["q_a"] = fast["q_a"][np.arange(len(fast["time"])) // every * every]
@@ -201,7 +201,7 @@ SECOND_EARLIER = "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0
         (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1 (per cent: --map u_a="),
         (GOOD.replace("0.10", "0.05"), "run x, column time: expected stamps that rise, got a step"),
         (SECOND_EARLIER, "run x, column time: expected stamps that rise, got a step of -0.03 at 1"),
-        ("run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\n", "run x, q of ['a']: expected new angles at the"),
+        ("run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\n", "run x, column time: expected new angles at the"),
     ],
 )
 def test_read_log__names_file_and_place_of_what_is_wrong(tmp_path, text, message):
