@@ -93,5 +93,3 @@ def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expe
     assert {verdict(claim, PPO, LOW) for claim in result} == {TRUE}
     numbers = result[1]["numbers"][f"{TITLES[PPO]} against {TITLES[HIGH]}"]
     assert numbers["drift along z"]["mean"] == pytest.approx(drift - 0.2)
-    one_start = claims.task_claims([run for run in runs if run["start"] == 0])[2:]
-    assert {verdict(claim, PPO, LOW) for claim in one_start} == {UNKNOWN}

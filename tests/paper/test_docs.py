@@ -25,12 +25,21 @@ ROW = re.compile(r"^\| \[`(\w+)\.py`\]\(brokk_min/\1\.py\) \| (\d+) \|", re.M)
 
 
 def test_readme__lists_the_files_of_the_method_with_their_lines() -> None:
-    rows = ROW.findall(README.read_text())
-    texts = [(ROOT / "brokk_min" / f"{name}.py").read_text() for name, _ in rows]
-    assert [int(lines) for _, lines in rows] == [text.count("\n") for text in texts]
+    text = README.read_text()
+    assert counted(text) == text, "run `python tests/paper/test_docs.py`"
     listed = ["__init__", "machine", "kinematics", "actuator", "jacobian"]
     listed += ["settings", "env", "ppo", "hw"]
-    assert [name for name, _ in rows] == listed
+    assert [name for name, _ in ROW.findall(text)] == listed
+
+
+def counted(text: str) -> str:
+    """The README with the line counts of today."""
+
+    def row(match: re.Match[str]) -> str:
+        lines = (ROOT / "brokk_min" / f"{match[1]}.py").read_text().count("\n")
+        return match[0].replace(f"| {match[2]} |", f"| {lines} |")
+
+    return ROW.sub(row, text)
 
 
 RESULT = re.compile(r"^\| .*?(PID|PPO|bound).*? \| ([\d.]+) \| ?([\d.]*) \| ?(.*) ?\|$", re.M)
@@ -102,15 +111,5 @@ def test_review__its_searches_find_nothing(call: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
 
 
-def write() -> None:
-    """Put the line counts into the table of the README."""
-
-    def counted(match: re.Match[str]) -> str:
-        lines = (ROOT / "brokk_min" / f"{match[1]}.py").read_text().count("\n")
-        return match[0].replace(f"| {match[2]} |", f"| {lines} |")
-
-    README.write_text(ROW.sub(counted, README.read_text()))
-
-
 if __name__ == "__main__":
-    write()
+    README.write_text(counted(README.read_text()))

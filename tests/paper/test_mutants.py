@@ -69,14 +69,11 @@ def planted(name: str, right: str, wrong: str) -> Iterator[None]:
     *_, changed = (new for old, new in zip(before, after) if old != new)  # a method after its class
     thing = attrgetter(changed.co_qualname)(module)
     function = inspect.unwrap(getattr(thing, "fget", None) or getattr(thing, "func", thing))
-    kept = function.__code__
-    function.__code__ = changed
-    clear_caches()
-    try:
-        yield
-    finally:
-        function.__code__ = kept
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(function, "__code__", changed)
         clear_caches()
+        yield
+    clear_caches()
 
 
 @cache
