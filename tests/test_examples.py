@@ -10,8 +10,8 @@ from helpers_bus import baseline
 
 from brokk_min.__main__ import main
 from brokk_min.cli.options import find_plant
-from brokk_min.env import initial_state, measure, transition
 from brokk_min.evaluation import baselines
+from brokk_min.evaluation.rollout import rollout
 from brokk_min.kinematics import forward_kinematics, tool_position
 from examples.mini_excavator import MINI_EXCAVATOR
 from examples.seven_joints import SEVEN_JOINTS
@@ -52,15 +52,12 @@ def test_crane__has_the_geometry_of_its_drawing():
 def test_example__moves_its_tool_along_each_axis(machine, plant):
     """By a PI controller that nobody tuned, for 2 s (the crane's slow valves: 4 s) at 0.15 m/s."""
     plant = find_plant(plant, machine)
-    controller, start = baseline(machine), np.tile(STARTS[machine], (3, 1))
-    state = initial_state(machine, start, 0.15 * np.eye(3), plant)
-    memory = controller.start(3)
+    start = np.tile(STARTS[machine], (3, 1))
     seconds = 4.0 if machine is TELESCOPIC_CRANE else 2.0
-    for _ in range(round(seconds * machine.rate)):
-        u, memory = controller(measure(machine, state.history, state.v_goal), memory)
-        state = transition(machine, plant, state, u)
-    before, after = (tool_position(forward_kinematics(machine, q)) for q in (start, state.q))
-    moved = after - before  # (axes, 3)
+    goals = np.tile(0.15 * np.eye(3), (round(seconds * machine.rate), 1, 1))
+    rng = np.random.default_rng(0)
+    trace = rollout(machine, baseline(machine), start, goals, 0.0, rng, plant)
+    moved = trace.p_tool[-1] - tool_position(forward_kinematics(machine, start))  # (axes, 3)
     along = np.diag(moved)
     assert (along > 0.06 * seconds).all() and (np.abs(moved - np.diag(along)) < 0.08).all(), moved
 

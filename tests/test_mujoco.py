@@ -12,6 +12,7 @@ from PIL import Image
 from brokk_min._files import SHIPPED
 from brokk_min.actuator import lever_arm
 from brokk_min.cli.options import find_plant
+from brokk_min.evaluation.preliminary import simulate
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import PWM_MAX
@@ -37,12 +38,8 @@ def speeds(plant):
 
 
 def run(plant, q, u, ticks):
-    """Angles [rad] (ticks, num, n) under held commands `u` (num, n)."""
-    state, angles = plant.reset(M, np.array(q)), []
-    for _ in range(ticks):
-        state = plant.step(M, state, u)
-        angles.append(state.q)
-    return np.array(angles)
+    """Angles [rad] (ticks + 1, num, n) under held commands `u` (num, n)."""
+    return simulate(M, plant, np.array(q), np.tile(u, (ticks, 1, 1)))
 
 
 def test_geometry__is_that_of_the_machine():

@@ -75,9 +75,8 @@ def record(chain: Chain, excitation: str, name: str) -> logs.Log:
 
 def fit_net(chain: Chain, name: str, log: logs.Log, recipe: Mapping[str, Any]) -> ActuatorNet:
     """Nets of all joints by our settings but for those of `recipe`, written to `name`.npz."""
-    m = chain.machine
     config = fitting.FitConfig(**{"steps": chain.budget.fit_steps, **recipe})
-    net = fitting.fit(log, config, chain.seed, m, m.name)
+    net = fitting.fit(log, config, chain.seed, chain.machine, chain.machine.name)
     save_net(chain.out / f"{name}.npz", net)
     return net
 

@@ -65,16 +65,6 @@ def test_net_claims__hold_where_nets_behave_as_the_papers_machine(change, expect
     assert means == [pytest.approx(like["down"] / 0.24), times, *map(pytest.approx, distances[:2])]
 
 
-def test_task_claims__on_drift_along_x_are_of_each_controller():
-    drift = {PPO: 0.02, HIGH: 0.03, LOW: 0.20, RAW: 0.3}
-    still, fails, *_ = claims.task_claims(runs_with({}, drift))
-    assert verdict(still, PPO) == TRUE
-    assert [verdict(fails, pid) for pid in (RAW, LOW, HIGH)] == [TRUE, TRUE, FALSE]
-    assert still["numbers"][TITLES[PPO]]["drift"]["mean"] == pytest.approx(0.021)
-    drift[PPO] = 0.09
-    assert verdict(claims.task_claims(runs_with({}, drift))[0], PPO) == FALSE
-
-
 @pytest.mark.parametrize(
     ("x", "z", "drift", "expected"),
     [
@@ -86,9 +76,14 @@ def test_task_claims__on_drift_along_x_are_of_each_controller():
     ],
 )
 def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expected):
+    """And those on drift along x are of each controller."""
     errors = {("x", PPO): x, ("z", PPO): z, PPO: 0.01, HIGH: 0.02, LOW: 0.05, RAW: 0.06}
-    runs = runs_with(errors, {PPO: drift, HIGH: 0.2, LOW: 0.4, RAW: 0.4})
-    result = claims.task_claims(runs)[2:]  # tracking, along z, all in all
+    drifts = {PPO: drift, ("x", HIGH): 0.03, HIGH: 0.2, LOW: 0.4, RAW: 0.4}
+    still, fails, *result = claims.task_claims(runs_with(errors, drifts))
+    assert [verdict(still, name) for name in (PPO, "rl_critic")] == [FALSE, TRUE]
+    assert [verdict(fails, pid) for pid in (RAW, LOW, HIGH)] == [TRUE, TRUE, FALSE]
+    assert still["numbers"][TITLES[PPO]]["drift"]["mean"] == pytest.approx(drift + 0.001)
+    # tracking, along z, all in all
     assert [verdict(claim, PPO, HIGH) for claim in result] == expected
     assert {verdict(claim, PPO, LOW) for claim in result} == {TRUE}
     numbers = result[1]["numbers"][f"{TITLES[PPO]} against {TITLES[HIGH]}"]

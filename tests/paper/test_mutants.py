@@ -19,7 +19,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import Phase, settings
 
@@ -83,10 +82,9 @@ def copies(path: Path) -> dict[str, Any]:
     phases = [Phase.explicit, Phase.generate]
     settings.register_profile("planted", settings.default, phases=phases, max_examples=200)
     settings.load_profile("planted")
-    try:
-        return runpy.run_path(str(path))
-    finally:
-        settings.load_profile(loaded)
+    names = runpy.run_path(str(path))
+    settings.load_profile(loaded)
+    return names
 
 
 def copy_of(test: str) -> Any:
@@ -109,8 +107,7 @@ def cases(test: Any) -> Iterator[dict[str, object]]:
 
 def finds_an_error(test: Any) -> bool:
     """Does the test fail by an assertion?"""
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for arguments in cases(test):
             try:
                 test(**arguments)
