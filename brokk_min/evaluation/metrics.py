@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from brokk_min import __version__
 from brokk_min.actuator import PLANT, Plant
+from brokk_min.env import reward
 from brokk_min.evaluation.rollout import Controller, Trace, rollout
 from brokk_min.evaluation.sequences import Commands
 from brokk_min.kinematics import forward_kinematics, tool_position
@@ -46,7 +47,7 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
         "off_axis_drift_mean": drift.mean(axis=0),
         "jerk_rms": np.sqrt(np.sum(jerk**2, axis=-1).sum(axis=0) / max(1, len(jerk))),
         "valve_travel": np.abs(np.diff(trace.u, axis=0, prepend=0 * trace.u[:1])).sum(axis=(0, 2)),
-        "reward_mean": trace.reward.mean(axis=0),
+        "reward_mean": reward(goals, trace.v_tool).mean(axis=0),
     }
 
 

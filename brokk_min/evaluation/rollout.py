@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brokk_min.actuator import PLANT, Plant
-from brokk_min.env import initial_state, measure, reward, transition
+from brokk_min.env import initial_state, measure, transition
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.learning.episodes import draw_noise
 from brokk_min.machine import Array, Machine, Measured
@@ -46,7 +46,6 @@ class Trace(NamedTuple):
     u: Array  # command during the tick, n
     p_tool: Array  # true tool position [m], 3
     v_tool: Array  # true tool velocity [m/s], 3
-    reward: Array
 
 
 def rollout(
@@ -74,6 +73,5 @@ def rollout(
         state = transition(machine, plant, state._replace(v_goal=v_goal), u)
         frames = forward_kinematics(machine, state.q)
         v_tool, p_tool = tool_velocity(frames, state.q_dot), tool_position(frames)
-        rewards = reward(goal, v_tool)
-        ticks.append(Trace(state.q, state.q_dot, u, p_tool, v_tool, rewards))
+        ticks.append(Trace(state.q, state.q_dot, u, p_tool, v_tool))
     return Trace(*(np.array(arrays) for arrays in zip(*ticks, strict=True)))

@@ -34,17 +34,18 @@ def test_metrics__by_hand():
     v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0], [0.3, 0, 0]])
     u = np.array([[0.0, 0.5], [0.2, 0.5], [0.2, -0.5], [0.2, -0.5]])
     p = np.outer([0.0, 0.1, 0.3, 0.0], [0, 1, 0])
-    goals, rewards = np.tile([0.1, 0.0, 0.0], (4, 1)), 1 / np.arange(1, 5)
-    arrays = (np.zeros((4, 5)), np.zeros((4, 5)), u, p, v, rewards)
+    goals = np.tile([0.1, 0.0, 0.0], (4, 1))
+    arrays = (np.zeros((4, 5)), np.zeros((4, 5)), u, p, v)
     trace = Trace(*(np.stack([array, 0 * array], axis=1) for array in arrays))
     goals = np.stack([goals, 0 * goals], axis=1)
     rows = m.metrics(BROKK_170, trace, goals, np.zeros((2, 3)))
+    rewards = (1 / 1.1 + 1 + 2 / 1.2) / 4, 1
+    np.testing.assert_allclose(rows.pop("reward_mean"), rewards)
     expected = {
         "velocity_error_mean": (0.1 + 0.0 + 0.2 + 0.2) / 4,
         "velocity_rmse": np.sqrt((0.01 + 0.04 + 0.04) / 4),
         "valve_travel": 0.5 + 0.2 + 1.0,  # from rest, then tick by tick
         "jerk_rms": np.sqrt((0.1**2 + 0.2**2) / 2) * 400,  # second differences at 20 Hz
-        "reward_mean": (1 + 1 / 2 + 1 / 3 + 1 / 4) / 4,
         "off_axis_drift_max": 0.3,
         "off_axis_drift_mean": 0.1,
     }
