@@ -75,10 +75,6 @@ def curves(ax):
     return {curve.get_label(): np.array(curve.get_data()) for curve in ax.get_lines()}
 
 
-def ylabels(figure):
-    return [ax.get_ylabel() for ax in figure.axes]
-
-
 def test_plot_tests__shows_machine_above_nets():
     x, kinds, tests = np.arange(3.0), ("machine", "nets"), ("sweeps", "coupling", "past movement")
     rows = {kind: {key: {kind: (x, k * x)} for key in tests} for k, kind in enumerate(kinds)}
@@ -102,13 +98,14 @@ def test_plot_errors__has_a_row_with_an_interval_for_each_controller():
 
 def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
     gap = Motion(*(RNG.normal(size=(4, 2, n)) for n in (5, 5, 3, 3)))
-    figure = report.plot_gap(BROKK_170, gap)
+    axes = report.plot_gap(BROKK_170, gap).axes
     joints = [[f"{name} [rad/s]", f"{name} [mrad]"] for name in ("q1", "q3", "q4", "q5")]
-    assert ylabels(figure) == ["tool [m/s]", "tool [mm]", *np.ravel(joints)]
+    labels = ["tool [m/s]", "tool [mm]", *np.ravel(joints)]
+    assert [ax.get_ylabel() for ax in axes] == labels
     time = [0.05, 0.1, 0.15, 0.2]
     distance = 1000 * np.linalg.norm(gap.p_tool, axis=-1)
-    np.testing.assert_allclose(curves(figure.axes[1])["first run"], [time, distance[:, 0]])
-    np.testing.assert_allclose(curves(figure.axes[9])["first run"], [time, 1000 * gap.q[:, 0, 4]])
+    np.testing.assert_allclose(curves(axes[1])["first run"], [time, distance[:, 0]])
+    np.testing.assert_allclose(curves(axes[9])["first run"], [time, 1000 * gap.q[:, 0, 4]])
 
 
 def test_plot_sequence__is_relative_to_where_the_tool_began():
@@ -126,9 +123,10 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
         np.testing.assert_allclose(above[policy], [time, trace.p_tool[:, 0, i] - p_start[i]])
         np.testing.assert_allclose(above[goal], [time, 0.05 * np.cumsum(goals[:, i])])
         np.testing.assert_allclose(below[policy], [time, trace.v_tool[:, 0, i]])
-    joints = report.plot_joint_velocities(BROKK_170, traces, "x")
-    assert ylabels(joints) == [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
-    np.testing.assert_array_equal(curves(joints.axes[2])[policy], [time, trace.q_dot[:, 0, 3]])
+    joints = report.plot_joint_velocities(BROKK_170, traces, "x").axes
+    labels = [f"velocity q{i} [rad/s]" for i in (1, 3, 4, 5)]
+    assert [ax.get_ylabel() for ax in joints] == labels
+    np.testing.assert_array_equal(curves(joints[2])[policy], [time, trace.q_dot[:, 0, 3]])
 
 
 def test_plot_starts__draws_arms_from_the_side_and_from_above():
