@@ -11,19 +11,13 @@ from brokk_min.machine import BROKK_170
 from brokk_min.viewer import replay
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    """A drive of two seconds along x, and the world that it was in."""
-    path = tmp_path_factory.mktemp("log") / "run.log"
+def test_replay__shows_the_drive_from_its_first_driven_tick(tmp_path):
+    """Two seconds along x: a picture of every second tick, and of the last."""
+    path, out = tmp_path / "run.log", tmp_path / "film.gif"
     world = World(BASELINE, HoldingOperator(), log=path)
     world.drive.begin()
     world.run(3.0)
     world.bus.close()
-    return path, world
-
-
-def test_scenes__are_the_drive_from_its_first_driven_tick(log):
-    path, world = log
     shown = replay.scenes(BROKK_170, path)
     assert 40 <= len(shown) <= 60
     q = np.array(world.recorder.q)  # each 5 ms
@@ -35,6 +29,11 @@ def test_scenes__are_the_drive_from_its_first_driven_tick(log):
     fk = forward_kinematics(BROKK_170, np.array([scene.q for scene in shown]))
     np.testing.assert_allclose(shown[-1].trail, tool_position(fk))
     assert (shown[0].title, shown[10].status) == ("run.log", "0.5 s")
+    assert run("replay", path, "--out", out) == 0
+    film = Image.open(out)
+    frames = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+    assert film.info["duration"] == 100 and len(frames) == len(shown) // 2 + 1
+    assert (frames[0] != frames[-1]).any(axis=-1).sum() > 300
 
 
 def test_scenes__refuses_a_log_in_which_nothing_drives(tmp_path):
@@ -42,13 +41,3 @@ def test_scenes__refuses_a_log_in_which_nothing_drives(tmp_path):
     idle.write_text("(1.0) can0 080# R\n(1.05) can0 080# R\n")
     with pytest.raises(ValueError, match=r"idle.log: expected a log in which the machine is driv"):
         replay.scenes(BROKK_170, idle)
-
-
-def test_replay__makes_a_film_of_every_second_tick_and_the_last(log, tmp_path):
-    out = tmp_path / "film.gif"
-    assert run("replay", log[0], "--out", out) == 0
-    film = Image.open(out)
-    frames = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
-    assert film.info["duration"] == 100
-    assert len(frames) == len(replay.scenes(BROKK_170, log[0])) // 2 + 1
-    assert (frames[0] != frames[-1]).any(axis=-1).sum() > 300
