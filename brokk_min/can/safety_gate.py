@@ -173,7 +173,7 @@ def first_fault(machine: Machine, faults: dict[str, Array]) -> Array:
     nodes = np.array([*machine.names, "valve controller"])
     words: Array = np.array("")
     for text, found in reversed(faults.items()):
-        if found.ndim == faults["error"].ndim:
+        if found.ndim == faults["error"].ndim:  # of the program, not of nodes
             words = np.where(found, text, words)
         else:
             named = np.char.add(nodes[found.argmax(axis=-1)], f": {text}")

@@ -112,16 +112,17 @@ def train(data: TrainingSet, config: FitConfig, seed: int) -> tuple[Array, ...]:
     generator = Generator().manual_seed(seed)
     weights = initial_weights(data, config, generator)
     optimizer = torch.optim.AdamW(weights, weight_decay=config.weight_decay, fused=True)
-    rate, batch, steps = config.learning_rate, config.batch_size, config.steps
-    stages = [(steps, rate, data.windows, batch, 1)]
-    if config.rollout > 1 and all(map(len, data.long_windows)):
-        first = round(0.65 * steps)
-        free_runs = (steps - first, rate / 4, data.long_windows, math.ceil(batch / 4))
-        stages = [(first, rate, data.windows, batch, 1), (*free_runs, config.rollout)]
-    for steps, rate, windows, batch, ticks in stages:
+    rate, batch = config.learning_rate, config.batch_size
+    several = config.rollout > 1 and all(map(len, data.long_windows))
+    first = round(0.65 * config.steps) if several else config.steps
+    stages = [(first, rate, data.windows, batch, 1)]
+    if several:
+        rest, fewer = config.steps - first, math.ceil(batch / 4)
+        stages.append((rest, rate / 4, data.long_windows, fewer, config.rollout))
+    for steps, peak, windows, size, ticks in stages:
         for step in tqdm(range(steps), desc=f"fit nets, {ticks} ticks", unit="step", disable=None):
-            optimizer.param_groups[0]["lr"] = 0.5 * rate * (1 + math.cos(math.pi * step / steps))
-            rows = [torch.randint(len(at), (batch,), generator=generator) for at in windows]
+            optimizer.param_groups[0]["lr"] = 0.5 * peak * (1 + math.cos(math.pi * step / steps))
+            rows = [torch.randint(len(at), (size,), generator=generator) for at in windows]
             drawn = [torch.from_numpy(at)[row] for at, row in zip(windows, rows, strict=True)]
             loss = accumulated_loss(data, weights, torch.stack(drawn, dim=1), ticks)
             optimizer.zero_grad()

@@ -90,12 +90,13 @@ def pieces_of(
     that is longer than `MAX_GAP` and 2.5 samples.
     """
     each = list(zip(q.T, fastest, strict=True))
-    wrong = np.stack([unread(time, angle, speed) for angle, speed in each], axis=1)
-    good = np.flatnonzero(~wrong.any(axis=1))
+    bad = np.stack([unread(time, angle, speed) for angle, speed in each], axis=1)
+    good = np.flatnonzero(~bad.any(axis=1))
     gap = np.diff(time[good]) > max(MAX_GAP, 2.5 / rate)
-    wrong[good] = np.stack([jumps(time[good], angle[good], speed) for angle, speed in each], axis=1)
-    pieces = np.split(good, np.flatnonzero(gap | wrong[good[1:]].any(axis=1)) + 1)
-    return [piece for piece in pieces if len(piece)], wrong
+    cuts = np.zeros_like(bad)
+    cuts[good] = np.stack([jumps(time[good], angle[good], speed) for angle, speed in each], axis=1)
+    pieces = np.split(good, np.flatnonzero(gap | cuts[good[1:]].any(axis=1)) + 1)
+    return [piece for piece in pieces if len(piece)], bad | cuts
 
 
 def left_out(wrong: NDArray[np.bool_], q: Array, joints: Sequence[str]) -> Iterator[str]:

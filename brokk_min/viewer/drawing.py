@@ -43,7 +43,7 @@ def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
         part = Image.new("RGB", view.size, BACKGROUND)
         pen = ImageDraw.Draw(part)
         _backdrop(pen, machine, view)
-        _arm(pen, machine, view, scene)
+        _arm_and_tool(pen, machine, view, scene)
         image.paste(part, view.corner)
     pen = ImageDraw.Draw(image)
     pen.text((28, HEAD / 2), scene.title, INK, _font(30), "lm")
@@ -112,7 +112,7 @@ def _backdrop(pen: Pen, machine: Machine, view: View) -> None:
     pen.text((16, 20), f"{view.label}, grid of 1 m", MUTED, _font(22), "lm")
 
 
-def _arm(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
+def _arm_and_tool(pen: Pen, machine: Machine, view: View, scene: Scene) -> None:
     """Links from the base frame's origin on, joints, the tool's trail, arrows of its velocities."""
     ends = view.project(forward_kinematics(machine, scene.q).p)
     radius = max(6.0, 0.02 * extent(machine)[0] * view.scale)
@@ -153,6 +153,5 @@ def _joint_row(pen: Pen, machine: Machine, scene: Scene, i: int, size: tuple[int
     pen.line((middle, y - 16, middle, y + 16), colour, 4)
     angle = f"{q:+z.2f} rad" if joint.kind == "revolute" else f"{q:+z.2f} m"
     command = f"{round(counts):+d} of {machine.pwm_limit}" if joint.driven else "locked"
-    texts = {28: joint.name, left + length + 16: angle, valve + length + 16: command}
-    for x, text in texts.items():
+    for x, text in ((28, joint.name), (left + length + 16, angle), (valve + length + 16, command)):
         pen.text((x, y), text, colour, _font(24), "lm")

@@ -111,8 +111,11 @@ def test_fit__refuses_what_cannot_be_learned():
         fit(Log(("boom", "stick"), (still,)), FitConfig(steps=1), 0, BROKK_170)
 
 
-def test_fit__has_ranges_with_a_margin_and_without_the_jump_between_recordings():
+def test_fit__has_windows_and_ranges_without_the_jump_between_recordings():
     log = Log(("a",), (line("x", 0, 0.1, 30), line("y", 5, 0.2, 40)))
+    data = TrainingSet(log, FitConfig(rollout=8, valve=False), BROKK_170, np.zeros((1, 2)))
+    np.testing.assert_array_equal(data.windows[0], [*range(12, 29), *range(42, 69)])
+    np.testing.assert_array_equal(data.long_windows[0], [*range(12, 22), *range(42, 62)])
     net = fit(log, FitConfig(steps=0), 0, BROKK_170)
     ranges = (net.output_low, net.output_high, net.q_low, net.q_high)
     np.testing.assert_allclose(ranges, [[0.095], [0.205], [0.0], [5.39]], atol=1e-5)
