@@ -95,11 +95,13 @@ def expected(path: Path, what: str) -> Iterator[None]:
         raise ValueError(f"{path}: {told.removeprefix(f'{path}: ')}") from error
 
 
-def expect_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """ValueError for the first entry of `wanted` that `found` has otherwise."""
+def expect_same(place: Path | str, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """ValueError for the first entry of `wanted`, also within an entry, that `found` has not."""
     for name, value in wanted.items():
-        same = found.get(name) == value
-        require(same, f"{path}: {name}", brief(value), brief(found.get(name)))
+        got = found.get(name)
+        if isinstance(value, dict) and isinstance(got, dict):
+            expect_same(f"{place}: {name}", got, value)
+        require(got == value, f"{place}: {name}", brief(value), brief(got))
 
 
 def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:

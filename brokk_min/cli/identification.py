@@ -119,6 +119,7 @@ class Fit(ReadsLogs):
         fits = settings.valve or settings.members == 1
         check(fits, "--members", "1 of nets that read the commands", settings.members)
         check(self.seed >= 0, "--seed", "0 or more", self.seed)
+        check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs, machine)
         if self.test:

@@ -74,6 +74,8 @@ class Drive(Command):
             return find_controller(machine, self.policy, self.controller == "rl")
         driven = [machine.names[i] for i in machine.driven]
         check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
+        limit = machine.pwm_limit
+        check(0 < self.counts <= limit, "--counts", f"1 to {limit}", self.counts)
         return JointJog(machine, self.joint, self.counts)
 
     def find_operator(self, machine: Machine) -> Any:

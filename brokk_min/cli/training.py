@@ -66,6 +66,7 @@ class Train(Training):
 class Sweep(Training):
     """Train and evaluate many seeds, one process each; finished seeds are not run again."""
 
+    out: Path  # Folder to write policies, their curves and sweep.json to.
     seeds: int = 10  # How many, from --seed on.
     scheduler: str | None = None  # tcp://... of dask; its workers must see OUT. None: this machine.
     num_starts: int = 16  # Start poses for each scored sequence.

@@ -53,5 +53,6 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
     assert written["table"]["all"][ERROR] == pytest.approx(mean)
     assert f"{ERROR:24} {metrics.interval_text(mean)}\n" in printed
     other = replace(RECIPE, task=replace(RECIPE.task, episode_s=0.8))
-    with pytest.raises(ValueError, match=r"seed_4\.npz: recipe: expected .*0\.8.*, got .*20\.0"):
+    told = r"seed_4\.npz: recipe: task: episode_s: expected 0\.8, got 20\.0"
+    with pytest.raises(ValueError, match=told):
         sweep.run_seed(BROKK_170, NET, other, out, 2, 4)
