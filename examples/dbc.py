@@ -52,7 +52,11 @@ def dbc(machine: Machine) -> str:
 
 def main(out: str = "bus.dbc", machine: str = "brokk170") -> None:
     """Write the DBC file of a machine."""
-    Path(out).write_text(dbc(Command(machine=machine).find_machine()), newline="")
+    try:
+        text = dbc(Command(machine=machine).find_machine())
+    except ValueError as error:
+        sys.exit(str(error))
+    Path(out).write_text(text, newline="")
 
 
 if __name__ == "__main__":

@@ -2,10 +2,11 @@
 
 import cantools
 import numpy as np
+import pytest
 
 from brokk_min.can.canopen import encoder_raw, node_numbers, valve_frame
 from brokk_min.machine import BROKK_170
-from examples.dbc import dbc
+from examples.dbc import dbc, main
 
 
 def test_dbc__describes_the_frames_that_the_program_uses():
@@ -22,3 +23,14 @@ def test_dbc__describes_the_frames_that_the_program_uses():
     raw = int(encoder_raw(BROKK_170, np.full(5, -5))[1])
     assert database.decode_message(0x182, raw.to_bytes(4, "little")) == {"position": raw}
     assert database.decode_message(0x700 + controller, b"\x05") == {"state": 5}
+
+
+def test_main__refuses_names_that_dbc_files_cannot_tell_apart(tmp_path):
+    (tmp_path / "alike.py").write_text(
+        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170 as m\n"
+        "a, b, *rest = m.joints\n"
+        "ALIKE = replace(m, joints=(replace(a, name='a 1'), replace(b, name='a-1'), *rest))\n"
+    )
+    with pytest.raises(SystemExit, match="^joints: expected names that differ in DBC files"):
+        main(str(tmp_path / "a.dbc"), f"{tmp_path}/alike.py:ALIKE")
+    assert not (tmp_path / "a.dbc").exists()
