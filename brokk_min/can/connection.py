@@ -111,7 +111,11 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         raw = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
         raise ValueError(f"{where}, got {brief(error)}") from error
-    bus = Bus(raw, channel, log, echo=interface == "udp_multicast")
+    try:
+        bus = Bus(raw, channel, log, echo=interface == "udp_multicast")
+    except OSError:  # the log cannot be written
+        raw.shutdown()
+        raise
     with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
         bus.file = raw.fileno()
     try:

@@ -56,8 +56,11 @@ class Joystick:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a window, or this
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         self.pygame = require_package("pygame", "play")
-        self.pygame.display.init()
-        self.pygame.joystick.init()
+        try:
+            self.pygame.display.init()
+            self.pygame.joystick.init()
+        except self.pygame.error as error:
+            raise ValueError(f"joystick: expected SDL to start, got {error}") from error
         found = self.pygame.joystick.get_count() > 0
         require(found, "joystick", "one, or --command FILE.csv", "none")
         self.speed, self.axes, self.button = machine.tool_speed, axes, button
@@ -70,9 +73,10 @@ class Joystick:
 
     def __call__(self, driving: bool, ready: bool) -> OperatorInput:
         """Velocity and switch; a device that is gone reads zero, so its removal is an event."""
-        gone = self.pygame.event.get(self.pygame.JOYDEVICEREMOVED)
         number = self.stick.get_instance_id()
-        self.alive = self.alive and all(event.instance_id != number for event in gone)
+        for event in self.pygame.event.get():  # all kinds, because a full queue takes no more
+            if event.type == self.pygame.JOYDEVICEREMOVED and event.instance_id == number:
+                self.alive = False
         if not self.alive:
             return OperatorInput(alive=False)
         deflection = -shape_axis([self.stick.get_axis(i) for i in self.axes])

@@ -31,6 +31,7 @@ class Evaluate(Command):
     def __call__(self, machine: Machine) -> None:
         self.writes(self.json, self.save_gains)
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
+        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         path, gains = default_policy(machine, self.policy)
         gains = None if self.save_gains else gains
         files = {"rl": path.name} if self.policy else POLICIES
@@ -95,6 +96,7 @@ class Reproduce(Command):
     def __call__(self, machine: Machine) -> None:
         from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce  # loads torch
 
+        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         budget = QUICK if self.quick else Budget()
         file = self.out / "results.json"
         check(self.force or not file.exists(), str(file), "no file (or --force)", "one")

@@ -34,6 +34,7 @@ class Collect(Command):
 
     def __call__(self, machine: Machine) -> None:
         check(self.out.suffix in (".csv", ".npz"), "--out", "a name in .csv or .npz", self.out)
+        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         check(0 < self.hours <= 100, "--hours", "above 0, to 100", self.hours)
         self.writes(self.out)
         rng, plant = np.random.default_rng(self.seed), find_plant(self.plant, machine)

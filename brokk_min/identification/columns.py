@@ -77,6 +77,8 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
 
 def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
     """A column in the units of the log; ValueError: the row of what cannot be a value."""
+    if values.dtype.kind == "S":
+        values = values.astype(str)
     if values.dtype.kind == "M":
         values = (values - values[:1]) / np.timedelta64(1, "s")
     elif name == "time" and values.dtype.kind in "US" and ":" in values[0]:

@@ -201,7 +201,7 @@ def warnings(
             slopes = ", ".join(f"{slope:+.2f} times with {one}" for one, slope in r.follows.items())
             doubt = "is it an angle to the ground? Then take differences of both angles"
             yield f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}"
-        elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 1e-9:
+        elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 0.51 / log.rate:
             got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
             yield f"{name}: expected {LEAST_EXPLAINED:.0%} of its motion by its commands, got {got}"
         if joint := joints.get(name):

@@ -58,6 +58,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         require(isinstance(config, TaskConfig), "config", "a TaskConfig", config)
         require(hasattr(plant, "step"), "plant", "reset and step", plant)
         if max_episode_steps is not None:
+            require(max_episode_steps > 0, "max_episode_steps", "1 or more", max_episode_steps)
             config = replace(config, episode_s=max_episode_steps / machine.rate)
         self.mode = AutoresetMode(autoreset_mode)
         self.metadata = TaskEnv.metadata | {"autoreset_mode": self.mode}
@@ -79,6 +80,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         mask = (options or {}).get("reset_mask")
         mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
         fits = mask.shape == (self.num_envs,) and mask.dtype == bool
+        fits = fits and bool(mask.any()) and (bool(mask.all()) or hasattr(self, "state"))
         require(fits, "reset_mask", f"{self.num_envs} booleans", f"{mask.dtype} {mask.shape}")
         self.begin_episodes(mask)
         return self.obs, {}

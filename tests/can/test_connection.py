@@ -51,6 +51,8 @@ def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
         bus.bus.shutdown, shutdown = raises(can.CanOperationError("gone")), bus.bus.shutdown
     shutdown()
     assert (tmp_path / "l").read_text().endswith(" v 080# T\n")
+    with pytest.raises(IsADirectoryError), open_bus("virtual", "v", tmp_path):
+        raise AssertionError("a log in the place of a folder")
 
 
 def test_recv__waits_for_the_descriptor_by_its_own_clock():

@@ -31,6 +31,6 @@ def test_main__refuses_names_that_dbc_files_cannot_tell_apart(tmp_path):
         "a, b, *rest = m.joints\n"
         "ALIKE = replace(m, joints=(replace(a, name='a 1'), replace(b, name='a-1'), *rest))\n"
     )
-    with pytest.raises(SystemExit, match="^joints: expected names that differ in DBC files"):
+    with pytest.raises(SystemExit, match=r"^joints: expected names that differ in DBC files"):
         main(str(tmp_path / "a.dbc"), f"{tmp_path}/alike.py:ALIKE")
     assert not (tmp_path / "a.dbc").exists()

@@ -4,6 +4,7 @@ import re
 from types import SimpleNamespace
 
 import numpy as np
+import pygame
 import pytest
 from helpers_bus import Virtual
 
@@ -54,11 +55,15 @@ def test_joystick__gives_switch_and_velocity_of_a_virtual_device():
     assert stick(True, True).v_goal == pytest.approx(expected, abs=1e-4)
     device.button(5, False)
     assert not stick(True, True).enable
+    for _ in range(3):  # of 65,535 events that SDL keeps, in a long drive
+        for _ in range(30_000):
+            pygame.event.post(pygame.event.Event(pygame.JOYAXISMOTION))
+        stick(True, True)
     device.unplug()
     assert stick(True, True) == stick(True, True) == OperatorInput(alive=False)
 
 
-def test_joystick__refuses_a_device_without_its_axes_or_button():
+def test_joystick__refuses_a_device_without_its_axes_or_button(monkeypatch):
     with pytest.raises(ValueError, match="joystick: expected one, or --command"):
         Joystick(BROKK_170)
     device = Virtual()
@@ -67,6 +72,10 @@ def test_joystick__refuses_a_device_without_its_axes_or_button():
         with pytest.raises(ValueError, match=re.escape(refusal)):
             Joystick(BROKK_170, axes, button)
     device.unplug()
+    pygame.display.quit()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
+    with pytest.raises(ValueError, match="joystick: expected SDL to start, got nonsense"):
+        Joystick(BROKK_170)
 
 
 def test_joint_jog__moves_one_joint_with_the_sign_of_x():

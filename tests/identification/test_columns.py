@@ -72,8 +72,9 @@ def test_read_log__says_which_column_and_how_to_map_it(tmp_path, mapping, messag
 def test_load_table__takes_numbers_as_names_and_datetimes_as_time(tmp_path, run):
     """A single one is for all rows; a table without `run` is one recording by its file's name."""
     start, tick = np.datetime64("2026-01-02T03:04:05"), np.timedelta64(50, "ms")
-    columns = {"time": start + np.arange(3) * tick, "u_a": np.zeros(3), "q_a": np.arange(3) / 50}
+    columns = {"time": start + np.arange(3) * tick, "u_a": np.zeros(3), "q_a": [b"0", b"1", b"2"]}
     np.savez(tmp_path / "3.npz", **columns | ({} if run is None else {"run": run}))
     table = load_table(tmp_path / "3.npz", {})
     assert table["run"].tolist() == ["3"] * 3
     np.testing.assert_allclose(table["time"], [0, 0.05, 0.1])
+    np.testing.assert_array_equal(table["q_a"], [0, 1, 2])

@@ -174,6 +174,10 @@ def test_make__gives_an_environment_that_gymnasium_and_stable_baselines_accept()
 
 
 def test_make_vec__gives_the_vector_class():
+    with pytest.raises(ValueError, match="max_episode_steps: expected 1 or more, got 0"):
+        gymnasium.make_vec(ID, num_envs=2, max_episode_steps=0)
+    with pytest.raises(ValueError, match="reset_mask: expected 2 booleans"):
+        TaskVectorEnv(2).reset(options={"reset_mask": np.array([True, False])})  # the first reset
     env = gymnasium.make_vec(ID, num_envs=256, max_episode_steps=6)
     assert isinstance(env.unwrapped, TaskVectorEnv)
     assert env.unwrapped.config == SIX_TICKS
