@@ -1,13 +1,17 @@
 """Learners side by side: seconds of CPU from nets to a policy as good as the optimised PID.
 
     python -m benchmarks.peers [--learners groups critic sb3 cleanrl] [--steps 800000] [--seed 0]
+    python -m benchmarks.peers --search 6 --steps 400000
 
 All train the paper's network on the same environments with our agent's interface, on one thread.
 At times, off the clock, the policy runs on the machine, on goals like those of the tuning. A run
-ends when its error there is `--share` of that of the optimised PID with the paper's structure. The
-settings were the best of six random ones for each of the four learners (commit `0739b31` has the
-search). Stable-Baselines3 is no dependency: `pip install stable-baselines3`.
+ends when its error there is `--share` of that of the optimised PID with the paper's structure.
+`--search` trains each learner with the same random settings, of `CHOICES`, and prints the errors at
+the end; races have the best of them. Stable-Baselines3 is no dependency:
+`pip install stable-baselines3`.
 """
+
+from __future__ import annotations
 
 import contextlib
 import time
@@ -36,8 +40,15 @@ from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.settings import PPOConfig
 
-SETTINGS: dict[str, Any] = {
-    "target_kl": PPOConfig.target_kl,
+CHOICES: dict[str, tuple[float, ...]] = {
+    "learning_rate": (2e-4, 6e-4, 1.2e-3, 2.4e-3),
+    "epochs": (2, 4, 8),
+    "minibatch_size": (512, 1024, 2048),
+    "gamma": (0.8, 0.9, 0.94, 0.97),
+    "gae_lambda": (0.8, 0.9, 0.95, 1.0),
+    "log_std": (-0.7, -1.2, -1.7),
+}
+SETTINGS = {  # of six random ones the best for each of the four learners
     "learning_rate": 2.4e-3,
     "epochs": 4,
     "minibatch_size": 1024,
@@ -59,6 +70,7 @@ class Options:
     seed: int = 0  # Of each.
     runs: int = 16  # Runs of 20 s on the machine for each error.
     share: float = 1.0  # Of the PID's error, at which a run ends.
+    search: int = 0  # So many settings of each, instead of a race.
 
 
 def ours(env: TaskVectorEnv, config: PPOConfig, seed: int, report: Report) -> None:
@@ -162,9 +174,9 @@ def scaled(reward: np.ndarray, config: PPOConfig) -> np.ndarray:
     return ((1 - config.gamma) * reward).astype(np.float32)
 
 
-def machine_error(controller: Controller, runs: int) -> float:
+def machine_error(controller: Controller, runs: int, seed: int = 1) -> float:
     """Mean |v_goal - v_tool| on the machine [m/s], on goals as those of the tuning."""
-    start, goals = tuning_set(M, runs, seed=1)
+    start, goals = tuning_set(M, runs, seed)
     trace = rollout(M, controller, start, goals, 0.05, np.random.default_rng(0))
     return float(np.linalg.norm(goals - trace.v_tool, axis=-1).mean())
 
@@ -203,18 +215,21 @@ class Clock:
         layers = [layer for layer in actor if isinstance(layer, nn.Linear)]
         pairs = [(layer.weight.T, layer.bias) for layer in layers]
         weights = tuple(x.detach().numpy().copy() for pair in pairs for x in pair)
-        return machine_error(Policy(M, {}, weights, self.net, "beyond"), self.options.runs)
+        policy = Policy(M, {}, weights, self.net, "beyond")
+        goals = 2 if self.options.search else 1  # seeds of goals
+        return machine_error(policy, self.options.runs, goals)
 
 
 LEARNERS = {"groups": ours, "critic": ours, "sb3": sb3, "cleanrl": cleanrl}
 
 
-def run(name: str, clock: Clock) -> None:
+def run(name: str, settings: dict[str, Any], clock: Clock) -> None:
     """Train one learner until it has reached the target, or to the end."""
     torch.set_num_threads(1)
     groups, options = name == "groups", clock.options
     recipe = find_recipe(critic=not groups)
-    config = replace(recipe.learner, total_steps=options.steps, **SETTINGS)
+    rates = {"target_kl": PPOConfig.target_kl, **settings}  # for all the same
+    config = replace(recipe.learner, total_steps=options.steps, **rates)
     simulation = (config.num_envs, clock.net, M, recipe.task, INTERFACE)
     env = TaskVectorEnv(*simulation)
     if groups:
@@ -226,12 +241,23 @@ def run(name: str, clock: Clock) -> None:
 
 def main(options: Options) -> None:
     net = load_policy(POLICY, M).net
+    rng = np.random.default_rng(0)
+    names, choices = list(CHOICES), list(CHOICES.values())
+    for _ in range(options.search):
+        settings = dict(zip(names, [rng.choice(of).item() for of in choices], strict=True))
+        for name in options.learners:
+            clock = Clock(net, options, 0.0)
+            clock.check = options.steps  # at the end alone
+            run(name, settings, clock)
+            print(f"{name} {clock.best:.4f} {clock.seconds:.0f} {settings}", flush=True)
+    if options.search:
+        return
     pid = read_gains(POLICY.with_name("gains.json"), M, net)["jacobian_pid_k0.1"]
     target = options.share * machine_error(pid, options.runs)
     print(f"level: {target:.4f} m/s\n\n| learner | CPU [s] | thousand steps | least error |")
     for name in options.learners:
         clock = Clock(net, options, target)
-        run(name, clock)
+        run(name, SETTINGS, clock)
         cells = [f"{clock.seconds:.1f}", f"{clock.steps / 1e3:.0f}"]
         cells = cells if clock.best <= target else ["not reached", ""]
         print(f"| {name} | {' | '.join(cells)} | {clock.best:.4f} |", flush=True)
