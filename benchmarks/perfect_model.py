@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brokk_min.actuator import PLANT, PlantState, lever_arm
+from brokk_min.actuator import PLANT, PlantState, cylinder_speeds, lever_arm
 from brokk_min.beyond.interface import REST_AFTER
 from brokk_min.evaluation.metrics import evaluate, means
 from brokk_min.evaluation.sequences import axis_sequences, evaluation_starts
@@ -26,8 +26,8 @@ from brokk_min.machine import (
     Array,
     Machine,
     Measured,
+    by_direction,
     limit_command,
-    side,
     valve_command,
     valve_opening,
 )
@@ -161,7 +161,7 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
     J = jacobian(forward_kinematics(machine, q))[..., driven]
     q_dot = (dls(J, np.ones(len(driven)), 1e-3) @ goal[..., None])[..., 0]
     v = q_dot * lever_arm(machine, q)[:, driven]  # of the cylinders [m/s]
-    return np.asarray(v / side(v, machine.cylinder_speeds[driven]))
+    return np.asarray(v / by_direction(v, cylinder_speeds(machine)[driven]))
 
 
 def main() -> None:

@@ -2,17 +2,18 @@
 
 Both are plants: they have `reset` and `step`, and either can move the machine. No net and no policy
 sees the equations of the analytic one. The nets read a history, which holds angle, velocity and
-command of the last 13 samples. `identification.fitting` makes nets from logs.
+command of the last 13 samples. `fit` makes nets from logs.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.machine import Array, Machine, side, valve_opening
+from brokk_min.machine import PWM_MAX, Array, Machine, by_direction, require, valve_opening
 
 
 class Plant(Protocol):
@@ -28,6 +29,93 @@ class Plant(Protocol):
 # --- the analytic plant ---------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Cylinder:
+    """What moves one joint: the third side of a triangle, opposite to the angle `angle` + q."""
+
+    base: float = 0.0  # m, from the joint's pivot to the cylinder's; 0: the arm is always `rod`
+    rod: float = 1.0  # m, from the joint's pivot to the rod's end
+    angle: float = 0.0  # rad, between these two sides at q = 0
+    area: float = 0.005  # m^2, of the piston
+    speed: tuple[float, float] | None = None  # m/s up, down at full command; None: by `q_dot_up`
+
+
+@dataclass(frozen=True)
+class Hydraulics:
+    """What the analytic plant knows beyond the machine. Controllers, nets and logs never read it.
+
+    A machine of your own needs none. The times are tuned to the paper's Fig. 2.
+    """
+
+    cylinders: Mapping[str, Cylinder] = field(default_factory=dict)  # by joint
+    gain: tuple[float, float] = (1.0, 1.0)  # by which all cylinders are faster up, down
+    pump_flow: float = 1.0  # m^3/s
+    delay: float = 0.040  # s, from command to valve
+    dt: float = 0.005  # s, step of explicit Euler
+    tau_spool: float = 0.030  # s, time constant of the spool
+    tau_cylinder: float = 0.030  # s, of the cylinder's speed
+    tau_valve_up: float = 0.15  # s, of a valve's activation, rising
+    tau_valve_down: float = 0.40  # s, falling
+    valve_threshold: float = 0.80  # activation below which a valve is closed
+    spool_threshold: float = 0.01  # of full stroke, above which a valve activates
+
+
+BROKK_CYLINDERS = {  # all assumed
+    # base, rod [m]  angle [rad]  area [m^2]  speed up, down [m/s]
+    "q1": Cylinder(0.0, 0.15, 0.00, 0.004, (0.0498, 0.0498)),
+    "q2": Cylinder(1.0, 0.35, 0.45, 0.010, (0.0588, 0.0802)),
+    "q3": Cylinder(0.9, 0.30, 0.80, 0.009, (0.0453, 0.0825)),
+    "q4": Cylinder(0.8, 0.25, -0.3, 0.006, (0.0370, 0.0662)),
+    "q5": Cylinder(0.6, 0.20, 0.40, 0.004, (0.0425, 0.0833)),
+}
+HYDRAULICS = {"brokk170": Hydraulics(BROKK_CYLINDERS, pump_flow=0.00105)}  # m^3/s; assumed
+
+
+@lru_cache
+def hydraulics(machine: Machine) -> Hydraulics:
+    """The hydraulics of a machine, by default plain ones.
+
+    ValueError: a cylinder's triangle that does not close, or a step that Euler cannot take.
+    """
+    h = machine.hydraulics or Hydraulics()
+    h = HYDRAULICS[h] if isinstance(h, str) else h
+    for joint in machine.joints:
+        cylinder = h.cylinders.get(joint.name, Cylinder())
+        require(cylinder.rod > 0, f"{joint.name}.rod", "a positive number", cylinder.rod)
+        low, high = cylinder.angle + joint.q_min, cylinder.angle + joint.q_max
+        closes = cylinder.base == 0 or 0 < low < high < np.pi
+        require(closes, f"{joint.name}.angle", "angles in (0, pi)", f"{low:.3f} to {high:.3f}")
+    fastest = min(h.tau_spool, h.tau_cylinder, h.tau_valve_up, h.tau_valve_down)
+    steps = machine.dt / h.dt
+    fits = abs(steps - round(steps)) < 1e-6 and h.dt <= fastest  # explicit Euler
+    require(fits, "hydraulics.dt", "a whole part of 1/rate, not above any tau", h.dt)
+    return h
+
+
+@lru_cache
+def cylinder_column(machine: Machine, name: str) -> Array:
+    """One number of the cylinders of all joints, (n,); read-only."""
+    of = hydraulics(machine).cylinders
+    column = np.array([getattr(of.get(j, Cylinder()), name) for j in machine.names], float)
+    column.setflags(write=False)
+    return column
+
+
+@lru_cache
+def cylinder_speeds(machine: Machine) -> Array:
+    """Speeds of the cylinders up and down at full command [m/s], (n, 2).
+
+    Where none is given, the joint's nominal speed is reached with the longest lever arm, `rod`.
+    """
+    h = hydraulics(machine)
+    rods = cylinder_column(machine, "rod")[:, None]
+    nominal = np.stack([machine.column("q_dot_up"), machine.column("q_dot_down")], axis=-1) * rods
+    nominal /= (machine.pwm_limit / PWM_MAX - machine.dead_zones) / (1 - machine.dead_zones)
+    given = [h.cylinders.get(name, Cylinder()).speed for name in machine.names]
+    speeds = [own or row for own, row in zip(given, nominal.tolist(), strict=True)]
+    return np.array(speeds) * h.gain
+
+
 class PlantState(NamedTuple):
     """State of the analytic plant, arrays (..., n) unless noted."""
 
@@ -35,7 +123,7 @@ class PlantState(NamedTuple):
     v: Array  # cylinder speed [m/s]
     s: Array  # spool position, -1..1
     z: Array  # valve activation, 0..1: below the threshold the valve is closed
-    delayed: Array  # commands not yet at the valve, next first, (..., n, delay / plant_dt)
+    delayed: Array  # commands not yet at the valve, next first, (..., n, delay / dt)
 
 
 class AnalyticPlant:
@@ -45,7 +133,8 @@ class AnalyticPlant:
         """The plant at rest at angles `q` [rad] (..., n)."""
         q = np.array(q, float)
         zero = np.zeros_like(q)
-        delayed = np.zeros((*q.shape, round(machine.delay / machine.plant_dt)))
+        h = hydraulics(machine)
+        delayed = np.zeros((*q.shape, round(h.delay / h.dt)))
         return PlantState(q, zero, zero, zero, delayed)
 
     def step(self, machine: Machine, state: PlantState, u: ArrayLike) -> PlantState:
@@ -53,7 +142,7 @@ class AnalyticPlant:
 
         Paper: eq1, Sec. 3.2 (delay, direction, coupling by a pump, past movement), 3.3 (dead zone)
         """
-        steps = round(machine.dt / machine.plant_dt)
+        steps = round(machine.dt / hydraulics(machine).dt)
         held = np.repeat(np.asarray(u, float)[..., None], steps, axis=-1)
         commands = np.concatenate([state.delayed, held], axis=-1)  # what the valve gets in turn
         openings = valve_opening(commands, machine.dead_zones[:, None])
@@ -75,27 +164,29 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
         >>> lever_arm(BROKK_170, [0.0, 0.5, 0.5, 1.7, 1.0]).round(3)
         array([0.15 , 0.337, 0.299, 0.247, 0.197])
     """
-    a, b = machine.column("cylinder_base"), machine.column("cylinder_rod")
-    gamma = machine.column("cylinder_angle") + np.asarray(q)
+    a, b = cylinder_column(machine, "base"), cylinder_column(machine, "rod")
+    gamma = cylinder_column(machine, "angle") + np.asarray(q)
     length = np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(gamma))
     return np.where(a > 0, a * b * np.sin(gamma) / length, b)  # a = 0: a constant arm, as of q1
 
 
 def euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantState:
-    """Spool, valve activation, cylinder speed and angle, `plant_dt` later."""
-    m, dt = machine, machine.plant_dt
+    """Spool, valve activation, cylinder speed and angle, `Hydraulics.dt` later."""
+    m, h = machine, hydraulics(machine)
+    dt = h.dt
     q, v, s, z, _ = state
-    s_next = s + dt * (opening - s) / m.tau_spool  # ds/dt = (opening - s) / tau_s
-    open_valve = np.abs(s) > m.spool_threshold
-    tau = np.where(open_valve > z, m.tau_valve_up, m.tau_valve_down)
+    s_next = s + dt * (opening - s) / h.tau_spool  # ds/dt = (opening - s) / tau_s
+    open_valve = np.abs(s) > h.spool_threshold
+    tau = np.where(open_valve > z, h.tau_valve_up, h.tau_valve_down)
     z_next = z + dt * (open_valve - z) / tau  # dz/dt = (open - z) / tau
-    x = np.clip((z - m.valve_threshold) / (1 - m.valve_threshold), 0.0, 1.0)
-    g = np.sqrt(x * x * (3 - 2 * x))  # g = sqrt(smoothstep(x))
-    v_steady = side(s, m.cylinder_speeds) * s * g  # of the cylinder, were it alone
-    flow = np.sum(np.abs(m.column("cylinder_area") * v_steady), axis=-1, keepdims=True)
-    pump = np.minimum(1.0, m.pump_flow / np.maximum(flow, 1e-12))  # min(1, Q / sum |A v_steady|)
+    x = np.clip((z - h.valve_threshold) / (1 - h.valve_threshold), 0.0, 1.0)
+    # g = sqrt(smoothstep(x)): q5 answers 0.40 s after idle, as in Fig. 2b; without the root 0.44 s
+    g = np.sqrt(x * x * (3 - 2 * x))
+    v_steady = by_direction(s, cylinder_speeds(m)) * s * g  # of the cylinder, were it alone
+    flow = np.sum(np.abs(cylinder_column(m, "area") * v_steady), axis=-1, keepdims=True)
+    pump = np.minimum(1.0, h.pump_flow / np.maximum(flow, 1e-12))  # min(1, Q / sum |A v_steady|)
     q_next = q + dt * v / lever_arm(m, q)  # dq/dt = v / r(q)
-    v_next = v + dt * (v_steady * pump - v) / m.tau_cylinder  # dv/dt = (v_steady pump - v) / tau_v
+    v_next = v + dt * (v_steady * pump - v) / h.tau_cylinder  # dv/dt = (v_steady pump - v) / tau_v
     q_next = np.clip(q_next, m.column("q_min"), m.column("q_max"))
     at_top = (q_next >= m.column("q_max")) & (v_next > 0)
     at_bottom = (q_next <= m.column("q_min")) & (v_next < 0)

@@ -1,4 +1,4 @@
-"""A machine as one frozen value: geometry, limits, valves, cylinders, encoders, CAN identifiers.
+"""A machine as one frozen value: geometry, limits, valves, encoders, CAN identifiers.
 
 To port the project means to write another `Machine`; nothing else knows a Brokk. The numbers of
 `BROKK_170` come from the paper, or are assumed (not the maker's data), or tuned (by our runs).
@@ -26,9 +26,7 @@ class Joint:
     """One joint: a row of standard Denavit-Hartenberg parameters, its range, its drive.
 
     T = Rz(theta) Tz(d) Tx(a) Rx(alpha). The joint variable q is added to theta [rad], or to d [m]
-    if the joint is prismatic; "rad" below means rad or m. The cylinder is the third side of a
-    triangle whose other sides, `cylinder_base` and `cylinder_rod`, meet at the angle
-    `cylinder_angle` + q. If `cylinder_base` is 0, the lever arm is always `cylinder_rod`.
+    if the joint is prismatic; "rad" below means rad or m.
     """
 
     name: str
@@ -42,30 +40,11 @@ class Joint:
     q_dot_up: float  # rad/s, nominal speed towards q_max at the command limit
     q_dot_down: float  # rad/s, nominal speed towards q_min, a positive number
     encoder_node: int  # CANopen node id
-    cylinder_base: float = 0.0  # m
-    cylinder_rod: float = 1.0  # m
-    cylinder_angle: float = 0.0  # rad
-    cylinder_area: float = 0.005  # m^2
-    cylinder_speed: tuple[float, float] = (0.0, 0.0)  # m/s up, down at full command; 0: see below
     dead_zone: tuple[float, float] = (0.07, 0.07)  # up, down, of full command; paper: Sec. 3.3
     encoder_zero: int = 0  # reading of the encoder at q = 0 [counts]
     encoder_sign: Literal[-1, 1] = 1  # -1: the encoder counts down while q rises
     kind: Literal["revolute", "prismatic"] = "revolute"
     encoder_step: float = 1e-4  # m a count of a prismatic joint; others have `encoder_bits`
-
-    def __post_init__(self) -> None:
-        """ValueError: an empty range, no pair, a speed below 0, a triangle that does not close."""
-        own, fields = f"{self.name}.", vars(self)
-        for name in ("dead_zone", "cylinder_speed"):
-            require(np.shape(fields[name]) == (2,), own + name, "a pair, up and down", fields[name])
-        for name in ("q_dot_up", "q_dot_down", "cylinder_rod"):
-            require(fields[name] > 0, own + name, "a positive number", fields[name])
-        known = self.kind in ("revolute", "prismatic")
-        require(known, f"{own}kind", "revolute or prismatic", self.kind)
-        require(self.q_min < self.q_max, f"{own}q_max", f"above {self.q_min}", self.q_max)
-        low, high = self.cylinder_angle + self.q_min, self.cylinder_angle + self.q_max
-        closes = self.cylinder_base == 0 or 0 < low < high < np.pi
-        require(closes, f"{own}cylinder_angle", "angles in (0, pi)", f"{low:.3f} to {high:.3f}")
 
 
 @dataclass(frozen=True)
@@ -84,34 +63,7 @@ class Machine:
     valve_frame_id: int  # CAN identifier of the valve frame
     controller_node: int  # CANopen node id of the valve controller
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: mid-range
-    # The fields below are of the analytic plant alone; its times are tuned to the paper's Fig. 2.
-    pump_flow: float = 1.0  # m^3/s
-    delay: float = 0.040  # s, from command to valve
-    plant_dt: float = 0.005  # s, step of explicit Euler
-    tau_spool: float = 0.030  # s, time constant of the spool
-    tau_cylinder: float = 0.030  # s, of the cylinder's speed
-    tau_valve_up: float = 0.15  # s, of a valve's activation, rising
-    tau_valve_down: float = 0.40  # s, falling
-    valve_threshold: float = 0.80  # activation below which a valve is closed
-    spool_threshold: float = 0.01  # of full stroke, above which a valve activates
-
-    def __post_init__(self) -> None:
-        """ValueError: what cannot be a machine, with the field, what is wanted and what it got."""
-        nodes = [*(joint.encoder_node for joint in self.joints), self.controller_node]
-        for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):
-            require(len(set(values)) == len(values), "joints", f"different {what}", values)
-        limit, zones, samples = self.pwm_limit, self.dead_zones, self.velocity_samples
-        require(1 <= limit <= PWM_MAX, "pwm_limit", "1 to 127", limit)
-        opens = bool(((zones >= 0) & (zones < limit / PWM_MAX)).all())  # else no valve ever does
-        require(opens, "dead_zone", f"0 to {limit}/{PWM_MAX}", zones.tolist())
-        require(2 <= samples <= self.history, "velocity_samples", "2 to history", samples)
-        inside = [j.q_min <= q <= j.q_max for j, q in zip(self.joints, self.q_start)]
-        fits = len(self.q_start) in (0, self.n) and all(inside)
-        require(fits, "q_start", f"{self.n} angles within their ranges", self.q_start)
-        steps = self.dt / self.plant_dt
-        fastest = min(self.tau_spool, self.tau_cylinder, self.tau_valve_up, self.tau_valve_down)
-        fits = abs(steps - round(steps)) < 1e-6 and self.plant_dt <= fastest  # explicit Euler
-        require(fits, "plant_dt", "a whole part of 1/rate, not above any tau", self.plant_dt)
+    hydraulics: Any = None  # of the analytic plant alone: an `actuator.Hydraulics`, or its name
 
     def __hash__(self) -> int:
         """By name, because `lru_cache` hashes a machine at each call."""
@@ -148,14 +100,6 @@ class Machine:
         return self.column("dead_zone")
 
     @cached_property
-    def cylinder_speeds(self) -> NDArray[np.float64]:
-        """Speeds at full command [m/s], (n, 2); by default q_dot_up and _down at least."""
-        given = self.column("cylinder_speed")
-        fastest = np.stack([self.column("q_dot_up"), self.column("q_dot_down")], axis=-1)
-        opening = (self.pwm_limit / PWM_MAX - self.dead_zones) / (1 - self.dead_zones)
-        return np.where(given > 0, given, fastest * self.column("cylinder_rod")[:, None] / opening)
-
-    @cached_property
     def encoder_step(self) -> NDArray[np.float64]:
         """Motion of each joint by one encoder count [rad], (n,)."""
         turn = 2 * np.pi / 2**self.encoder_bits
@@ -173,6 +117,57 @@ class Machine:
         column.setflags(write=False)
         return column
 
+    def __post_init__(self) -> None:
+        """ValueError: what cannot be a machine, with the field, what is wanted and what it got."""
+        for j in self.joints:
+            pair = np.shape(j.dead_zone) == (2,)
+            require(pair, f"{j.name}.dead_zone", "a pair, up and down", j.dead_zone)
+            for name in ("q_dot_up", "q_dot_down"):
+                speed = getattr(j, name)
+                require(speed > 0, f"{j.name}.{name}", "a positive number", speed)
+            known = j.kind in ("revolute", "prismatic")
+            require(known, f"{j.name}.kind", "revolute or prismatic", j.kind)
+            require(j.q_min < j.q_max, f"{j.name}.q_max", f"above {j.q_min}", j.q_max)
+        nodes = [*(joint.encoder_node for joint in self.joints), self.controller_node]
+        for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):
+            require(len(set(values)) == len(values), "joints", f"different {what}", values)
+        limit, zones, samples = self.pwm_limit, self.dead_zones, self.velocity_samples
+        require(1 <= limit <= PWM_MAX, "pwm_limit", "1 to 127", limit)
+        opens = bool(((zones >= 0) & (zones < limit / PWM_MAX)).all())  # else no valve ever does
+        require(opens, "dead_zone", f"0 to {limit}/{PWM_MAX}", zones.tolist())
+        require(2 <= samples <= self.history, "velocity_samples", "2 to history", samples)
+        inside = [j.q_min <= q <= j.q_max for j, q in zip(self.joints, self.q_start)]
+        fits = len(self.q_start) in (0, self.n) and all(inside)
+        require(fits, "q_start", f"{self.n} angles within their ranges", self.q_start)
+
+
+# Joints of the Brokk 170. Sources: all assumed, but the nominal speeds of q5 (paper, Sec. 3.2).
+# fmt: off
+_JOINTS = [
+    # name driven  a [m]  alpha [rad]  d [m]  theta [rad]    q_min, q_max  up, down [rad/s]  node
+    ("q1", True,   0.25,  np.pi / 2,   0.95,  0.0,           -2.14, 2.14,  0.20, 0.20,       1),
+    ("q2", False,  1.15,  0.0,         0.0,   0.0,            0.0,  1.4,   0.15, 0.22,       2),
+    ("q3", True,   1.25,  0.0,         0.0,   0.0,           -0.3,  1.6,   0.17, 0.28,       3),
+    ("q4", True,   1.15,  0.0,         0.0,   -np.pi,         0.6,  2.9,   0.22, 0.38,       4),
+    ("q5", True,   1.20,  0.0,         0.0,   -3 * np.pi / 4, 0.0,  2.0,   0.24, 0.47,       5),
+]
+# fmt: on
+BROKK_170 = Machine(
+    name="brokk170",
+    joints=tuple(Joint(*row) for row in _JOINTS),
+    rate=20.0,  # Hz; paper: Sec. 3.3
+    pwm_limit=80,  # counts of 127; paper: Sec. 3.2
+    encoder_bits=12,  # bits a turn; assumed
+    velocity_samples=4,  # samples; tuned
+    history=13,  # samples; paper: Table 1 (0.6 s)
+    tool_speed=0.3,  # m/s; assumed
+    ground=0.0,  # m; assumed
+    valve_frame_id=0x210,  # CAN id; assumed
+    controller_node=0x10,  # CANopen node id; assumed
+    q_start=(1.5, 0.5, 0.58, 1.71, 1.24),  # rad; paper: Sec. 4.1
+    hydraulics="brokk170",  # by this name in `actuator`
+)
+
 
 class Measured(NamedTuple):
     """What a machine's sensors tell a controller, in physical units and the base frame."""
@@ -184,7 +179,7 @@ class Measured(NamedTuple):
     history: Array  # angles, velocities, commands of the driven joints, (..., n_driven, 3, H)
 
 
-def side(u: Array, pairs: ArrayLike) -> Array:
+def by_direction(u: Array, pairs: ArrayLike) -> Array:
     """Of `pairs` (..., 2), up and down, those for up where u (...) > 0, else those for down."""
     pairs = np.asarray(pairs, u.dtype)
     return np.where(u > 0, pairs[..., 0], pairs[..., 1])
@@ -196,14 +191,14 @@ def valve_opening(u: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.floating]:
     `dead_zones` (..., 2) are up and down of each command. Paper: Sec. 3.3 (7 %)
     """
     u = 1.0 * np.asarray(u)  # whole numbers become floats
-    zone = side(u, dead_zones)
+    zone = by_direction(u, dead_zones)
     return np.asarray((u - np.clip(u, -zone, zone)) / (1 - zone))
 
 
 def valve_command(opening: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.floating]:
     """The command that opens a valve so far: the inverse of `valve_opening`, 0 for 0."""
     x = 1.0 * np.asarray(opening)
-    zone = side(x, dead_zones)
+    zone = by_direction(x, dead_zones)
     return np.asarray(np.sign(x) * zone + (1 - zone) * x)
 
 
@@ -241,40 +236,3 @@ def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
     """What encoders report for true angles `q` (..., n): whole counts, of the same float type."""
     q = 1.0 * np.asarray(q)
     return np.asarray(np.rint(q / machine.encoder_step) * machine.encoder_step, q.dtype)
-
-
-# Joints of the Brokk 170. Sources: all assumed, but the nominal speeds of q5 (paper, Sec. 3.2).
-# fmt: off
-_DH = [
-    # name driven  a [m]  alpha [rad]  d [m]  theta [rad]    q_min, q_max [rad]
-    ("q1", True,   0.25,  np.pi / 2,   0.95,  0.0,           -2.14, 2.14),
-    ("q2", False,  1.15,  0.0,         0.0,   0.0,            0.0,  1.4),
-    ("q3", True,   1.25,  0.0,         0.0,   0.0,           -0.3,  1.6),
-    ("q4", True,   1.15,  0.0,         0.0,   -np.pi,         0.6,  2.9),
-    ("q5", True,   1.20,  0.0,         0.0,   -3 * np.pi / 4, 0.0,  2.0),
-]
-_DRIVES = [
-    # up, down [rad/s]  node  base, rod [m]  angle [rad]  area [m^2]  speed up, down [m/s]
-    (0.20, 0.20,        1,    0.00, 0.15,     0.00,       0.0040,     (0.0498, 0.0498)),
-    (0.15, 0.22,        2,    1.00, 0.35,     0.45,       0.0100,     (0.0588, 0.0802)),
-    (0.17, 0.28,        3,    0.90, 0.30,     0.80,       0.0090,     (0.0453, 0.0825)),
-    (0.22, 0.38,        4,    0.80, 0.25,    -0.30,       0.0060,     (0.0370, 0.0662)),
-    (0.24, 0.47,        5,    0.60, 0.20,     0.40,       0.0040,     (0.0425, 0.0833)),
-]
-# fmt: on
-
-BROKK_170 = Machine(
-    name="brokk170",
-    joints=tuple(Joint(*dh, *drive) for dh, drive in zip(_DH, _DRIVES, strict=True)),
-    rate=20.0,  # Hz; paper: Sec. 3.3
-    pwm_limit=80,  # counts of 127; paper: Sec. 3.2
-    pump_flow=0.00105,  # m^3/s; assumed
-    encoder_bits=12,  # bits a turn; assumed
-    velocity_samples=4,  # samples; tuned
-    history=13,  # samples; paper: Table 1 (0.6 s)
-    tool_speed=0.3,  # m/s; assumed
-    ground=0.0,  # m; assumed
-    valve_frame_id=0x210,  # CAN id; assumed
-    controller_node=0x10,  # CANopen node id; assumed
-    q_start=(1.5, 0.5, 0.58, 1.71, 1.24),  # rad; paper: Sec. 4.1
-)

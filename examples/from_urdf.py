@@ -162,7 +162,7 @@ def make_machine(chain: Chain) -> Machine:
         name, kind = chain.model.names[chain.joints[i]], KINDS[chain.slides[i]]
         row = a, alpha, d, theta, low, high, speed, speed, i + 1
         joints.append(Joint(name, True, *row, kind=kind))
-    own = {"name": chain.model.name, "q_start": (), "pump_flow": 1.0}
+    own = {"name": chain.model.name, "q_start": (), "hydraulics": None}
     return replace(BROKK_170, joints=tuple(joints), **own)
 
 

@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 from mujoco.rollout import rollout
 
-from brokk_min.actuator import lever_arm
-from brokk_min.machine import Array, Joint, Machine, side, valve_opening
+from brokk_min.actuator import cylinder_column, cylinder_speeds, hydraulics, lever_arm
+from brokk_min.machine import Array, Joint, Machine, by_direction, valve_opening
 
 # All assumed.
 MASSES = (500.0, 180.0, 130.0, 110.0, 200.0)  # kg of slew, boom, two links, and link with breaker
@@ -79,7 +79,7 @@ class MujocoBrokk:
         model, data = build(machine, self.load, self.slope)
         flow, awake = flows(machine, state, u, self.pump)
         held = flow + state.force / STIFFNESS  # so that no weight moves a cylinder without flow
-        steps = round(machine.dt / machine.plant_dt)
+        steps = round(machine.dt / hydraulics(machine).dt)
         physics, force = rollout(model, data, state.physics, held[:, None], nstep=steps)
         q = physics[:, -1, 1 : 1 + machine.n]  # the time stands before the angles
         q = np.clip(q, machine.column("q_min"), machine.column("q_max"))
@@ -95,38 +95,38 @@ def flows(machine: Machine, state: State, u: Array, pump: float) -> tuple[Array,
     A valve opens beyond its dead zone, once it has woken up. Oil flows through it by the root of
     the pressure that the load leaves (orifice equation), and all valves share one pump.
     """
-    m, area = machine, machine.column("cylinder_area")
+    m, h, area = machine, hydraulics(machine), cylinder_column(machine, "area")
     x = valve_opening(u, m.dead_zones)
-    called = np.abs(x) > m.spool_threshold
-    tau = np.where(called, m.tau_valve_up, m.tau_valve_down)
+    called = np.abs(x) > h.spool_threshold
+    tau = np.where(called, h.tau_valve_up, h.tau_valve_down)
     awake = state.awake + (1 - np.exp(-m.dt / tau)) * (called - state.awake)
-    x = x * np.clip((awake - m.valve_threshold) / (1 - m.valve_threshold), 0, 1)
+    x = x * np.clip((awake - h.valve_threshold) / (1 - h.valve_threshold), 0, 1)
     against = LOAD_SHARE * np.sign(x) * state.force / (RELIEF * area)
-    v = side(x, m.cylinder_speeds) * x * np.sqrt(np.maximum(1 - against, 0))
+    v = by_direction(x, cylinder_speeds(m)) * x * np.sqrt(np.maximum(1 - against, 0))
     wanted = np.sum(area * np.abs(v), axis=-1, keepdims=True)  # m^3/s
-    return v * np.minimum(1, pump * m.pump_flow / np.maximum(wanted, 1e-12)), awake
+    return v * np.minimum(1, pump * h.pump_flow / np.maximum(wanted, 1e-12)), awake
 
 
 @lru_cache
 def build(machine: Machine, load: float, slope: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """MuJoCo's model of a machine with a load [kg] on a slope [deg], and memory to step it in."""
-    joints, tilt = machine.joints, np.deg2rad(slope)
+    joints, tilt, h = machine.joints, np.deg2rad(slope), hydraulics(machine)
     tip = f"{joints[-1].a} 0 {joints[-1].d}"
     links = f'<site name="tool" pos="{tip}"/><geom size="0.2" pos="{tip}" mass="{load}"/>'
     for i in reversed(range(machine.n)):  # each link holds the next one
         links = link(machine, i, links)
-    of_tendons = [joint.name for joint in joints if joint.cylinder_base]
+    of_tendons = [joint.name for joint in joints if h.cylinders[joint.name].base]
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco>
           <compiler angle="radian"/>
-          <option timestep="{machine.plant_dt}" integrator="implicitfast"
+          <option timestep="{h.dt}" integrator="implicitfast"
             gravity="{9.81 * np.sin(tilt)} 0 {-9.81 * np.cos(tilt)}">
             <flag contact="disable"/>
           </option>
           {SCENE}
           <worldbody>{links}</worldbody>
           <tendon>{"".join(TENDON.format(name) for name in of_tendons)}</tendon>
-          <actuator>{"".join(cylinder(machine, joint) for joint in joints)}</actuator>
+          <actuator>{"".join(actuator_of(machine, joint) for joint in joints)}</actuator>
           <sensor>{"".join(f'<actuatorfrc actuator="{name}"/>' for name in machine.names)}</sensor>
         </mujoco>""")
     return model, mujoco.MjData(model)
@@ -135,12 +135,13 @@ def build(machine: Machine, load: float, slope: float) -> tuple[mujoco.MjModel, 
 def link(machine: Machine, i: int, rest: str) -> str:
     """MJCF of a link with the `rest` at its tip.
 
-    Seen from the joint, foot and rod of the cylinder are at the angle `cylinder_angle` + q.
+    Seen from the joint, foot and rod of the cylinder are at the angle `Cylinder.angle` + q.
     """
     j, before = machine.joints[i], machine.joints[i - 1]
+    cylinder = hydraulics(machine).cylinders[j.name]
     place = f'pos="{before.a} 0 {before.d}" euler="{before.alpha} 0 {j.theta}"' if i else ""
-    foot = FEET[i], j.cylinder_base  # angle [rad], distance [m]
-    rod = FEET[i] + j.cylinder_angle, j.cylinder_rod
+    foot = FEET[i], cylinder.base  # angle [rad], distance [m]
+    rod = FEET[i] + cylinder.angle, cylinder.rod
     feet, rods = (f"{d * np.cos(angle)} {d * np.sin(angle)} 0" for angle, d in (foot, rod))
     return f"""
         <frame {place}>
@@ -154,13 +155,14 @@ def link(machine: Machine, i: int, rest: str) -> str:
         </frame>"""
 
 
-def cylinder(machine: Machine, j: Joint) -> str:
+def actuator_of(machine: Machine, j: Joint) -> str:
     """MJCF of a cylinder: f = STIFFNESS (flow - speed), within what the relief valves leave."""
-    moves = f'tendon="{j.name}"' if j.cylinder_base else f'joint="{j.name}" gear="{j.cylinder_rod}"'
-    push = RELIEF * j.cylinder_area  # N
-    pull = push * (ROD_SIDE if j.cylinder_base else 1)
-    delay = machine.delay - machine.plant_dt / 2  # between two steps, so that no rounding counts
+    h, c = hydraulics(machine), hydraulics(machine).cylinders[j.name]
+    moves = f'tendon="{j.name}"' if c.base else f'joint="{j.name}" gear="{c.rod}"'
+    push = RELIEF * c.area  # N
+    pull = push * (ROD_SIDE if c.base else 1)
+    delay = h.delay - h.dt / 2  # between two steps, so that no rounding counts
     return f"""
         <general name="{j.name}" {moves} forcerange="{-pull} {push}" dyntype="filter"
           dynprm="{TAU}" gainprm="{STIFFNESS}" biastype="affine" biasprm="0 0 {-STIFFNESS}"
-          delay="{delay}" nsample="{round(machine.delay / machine.plant_dt) + 1}"/>"""
+          delay="{delay}" nsample="{round(h.delay / h.dt) + 1}"/>"""

@@ -8,6 +8,7 @@ operator sets. Our valve frame has five joints, so `drive` needs another one for
 
 import numpy as np
 
+from brokk_min.actuator import Cylinder, Hydraulics
 from brokk_min.machine import Joint, Machine
 
 ROWS = [
@@ -35,7 +36,6 @@ SEVEN_JOINTS = Machine(
             q_dot_up=up,
             q_dot_down=down,
             encoder_node=0x21 + i,
-            cylinder_rod=0.2,
             dead_zone=(0.08, 0.08),  # up, down, of full command
         )
         for i, (name, driven, a, alpha, d, q_min, q_max, up, down) in enumerate(ROWS)
@@ -49,5 +49,5 @@ SEVEN_JOINTS = Machine(
     ground=0.0,
     valve_frame_id=0x230,
     controller_node=0x40,
-    pump_flow=0.0040,
+    hydraulics=Hydraulics({row[0]: Cylinder(rod=0.2) for row in ROWS}, pump_flow=0.0040),
 )

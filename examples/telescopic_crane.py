@@ -9,6 +9,7 @@ pivot.
 
 import numpy as np
 
+from brokk_min.actuator import Cylinder, Hydraulics
 from brokk_min.machine import Joint, Machine
 
 ZONE = (0.10, 0.10)  # dead zone of every valve up and down, of full command
@@ -20,7 +21,6 @@ SLEW = Joint(
     q_min=-2.5, q_max=2.5,  # rad
     q_dot_up=0.25, q_dot_down=0.25,  # rad/s at the command limit
     encoder_node=0x31,
-    cylinder_rod=0.20,
     dead_zone=ZONE,
 )
 LIFT = Joint(
@@ -29,7 +29,6 @@ LIFT = Joint(
     q_min=-0.2, q_max=1.2,
     q_dot_up=0.15, q_dot_down=0.22,
     encoder_node=0x32,
-    cylinder_base=1.0, cylinder_rod=0.4, cylinder_angle=0.6, cylinder_area=0.008,
     dead_zone=ZONE,
 )
 TELESCOPE = Joint(
@@ -52,6 +51,8 @@ TELESCOPIC_CRANE = Machine(
     tool_speed=0.3,
     ground=0.0,
     valve_frame_id=0x220, controller_node=0x40,
-    pump_flow=0.0020,
+    hydraulics=Hydraulics(  # of the analytic plant
+        {"slew": Cylinder(rod=0.20), "lift": Cylinder(1.0, 0.4, 0.6, 0.008)}, pump_flow=0.0020
+    ),
 )
 # fmt: on

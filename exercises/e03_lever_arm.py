@@ -49,11 +49,11 @@ def check(lever_arm: Callable[..., float], joint_velocity: Callable[..., float])
     agree("lever_arm", lever_arm, slope, cases, "Wanted: the slope of c(gamma).", 1e-4)
     velocity = joint_velocity(0.048, 3, 4, np.pi / 2)
     expect("joint_velocity(0.048, 3, 4, pi / 2)", velocity, 0.02, "q_dot = v / r")
-    joint = BROKK_170.joints[4]
+    joint, cylinder = BROKK_170.joints[4], actuator.BROKK_CYLINDERS["q5"]
     for q in (joint.q_min, 1.0, joint.q_max):
-        gamma = joint.cylinder_angle + q
+        gamma = cylinder.angle + q
         wanted = actuator.lever_arm(BROKK_170, np.full(5, q))[4]
-        got = lever_arm(joint.cylinder_base, joint.cylinder_rod, gamma)
+        got = lever_arm(cylinder.base, cylinder.rod, gamma)
         expect(f"lever arm of q5 at {q} rad", got, wanted)
-        v = joint.cylinder_speed[0] * (80 / 127 - 0.07) / 0.93  # at the command limit
+        v = actuator.cylinder_speeds(BROKK_170)[4, 0] * (80 / 127 - 0.07) / 0.93  # at the command limit
         print(f"q5 at {q:.1f} rad: r = {got:.3f} m, at 80 counts {v / got:.2f} rad/s")

@@ -7,6 +7,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from brokk_min.actuator import Cylinder, Hydraulics
 from brokk_min.machine import BROKK_170, Joint, Machine
 
 NUMBERS = itertools.count()
@@ -19,7 +20,7 @@ def reals(low: float, high: float) -> st.SearchStrategy[float]:
 
 
 @st.composite
-def joints(draw: st.DrawFn, index: int, driven: bool, limit: float) -> Joint:
+def joints(draw: st.DrawFn, index: int, driven: bool, limit: float) -> tuple[Joint, Cylinder]:
     """Any DH row and range; prismatic, a slew drive, or a triangle that closes over the range.
 
     Its dead zones are smaller than the largest command, `limit`.
@@ -30,7 +31,14 @@ def joints(draw: st.DrawFn, index: int, driven: bool, limit: float) -> Joint:
     kind = draw(st.sampled_from(["revolute", "revolute", "prismatic"]))
     slew = draw(st.booleans()) or kind == "prismatic"
     start = draw(reals(0.25, np.pi - 0.25 - width))  # the triangle's angle at q_min
-    return Joint(
+    cylinder = Cylinder(
+        base=0.0 if slew else draw(reals(0.5, 1.2)),
+        rod=draw(reals(0.1, 0.4)),
+        angle=0.0 if slew else start - q_min,
+        area=draw(reals(0.002, 0.02)),
+        speed=(draw(speeds), draw(speeds)),
+    )
+    joint = Joint(
         name=f"joint {index}",
         driven=driven,
         a=draw(reals(-1.5, 1.5)),
@@ -39,11 +47,6 @@ def joints(draw: st.DrawFn, index: int, driven: bool, limit: float) -> Joint:
         theta=draw(reals(-np.pi, np.pi)),
         q_min=q_min,
         q_max=q_min + width,
-        cylinder_base=0.0 if slew else draw(reals(0.5, 1.2)),
-        cylinder_rod=draw(reals(0.1, 0.4)),
-        cylinder_angle=0.0 if slew else start - q_min,
-        cylinder_area=draw(reals(0.002, 0.02)),
-        cylinder_speed=(draw(speeds), draw(speeds)),
         dead_zone=(draw(zones), draw(zones)),
         q_dot_up=draw(reals(0.1, 1.0)),
         q_dot_down=draw(reals(0.1, 1.0)),
@@ -51,6 +54,7 @@ def joints(draw: st.DrawFn, index: int, driven: bool, limit: float) -> Joint:
         kind=kind,
         encoder_step=draw(reals(1e-5, 2e-3)),
     )
+    return joint, cylinder
 
 
 @st.composite
@@ -59,14 +63,9 @@ def machines(draw: st.DrawFn) -> Machine:
     n = draw(st.integers(2, 6))
     driven = draw(st.lists(st.booleans(), min_size=n, max_size=n).filter(any))
     pwm_limit = draw(st.integers(20, 127))
-    return replace(
-        BROKK_170,
-        name=f"machine {next(NUMBERS)}",  # caches of the package hash names
-        joints=tuple(draw(joints(i, own, pwm_limit / 127)) for i, own in enumerate(driven)),
-        q_start=(),
-        rate=draw(st.sampled_from([10.0, 20.0, 25.0, 50.0])),
-        pwm_limit=pwm_limit,
-        ground=draw(reals(-1.0, 1.0)),
+    rows = [draw(joints(i, own, pwm_limit / 127)) for i, own in enumerate(driven)]
+    hydraulics = Hydraulics(
+        {joint.name: cylinder for joint, cylinder in rows},
         delay=draw(st.sampled_from([0.0, 0.005, 0.04, 0.1, 0.13])),
         tau_spool=draw(reals(0.01, 0.1)),
         tau_cylinder=draw(reals(0.01, 0.1)),
@@ -74,6 +73,16 @@ def machines(draw: st.DrawFn) -> Machine:
         tau_valve_down=draw(reals(0.02, 0.6)),
         valve_threshold=draw(reals(0.0, 0.9)),
         pump_flow=draw(reals(0.0002, 0.003)),
+    )
+    return replace(
+        BROKK_170,
+        name=f"machine {next(NUMBERS)}",  # caches of the package hash names
+        joints=tuple(joint for joint, _ in rows),
+        hydraulics=hydraulics,
+        q_start=(),
+        rate=draw(st.sampled_from([10.0, 20.0, 25.0, 50.0])),
+        pwm_limit=pwm_limit,
+        ground=draw(reals(-1.0, 1.0)),
         encoder_bits=draw(st.integers(8, 20)),
     )
 

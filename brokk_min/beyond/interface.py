@@ -45,7 +45,15 @@ from brokk_min import env
 from brokk_min.beyond.valve_nets import open_indicator, opening
 from brokk_min.jacobian import dls
 from brokk_min.kinematics import forward_kinematics, jacobian, tool_velocity
-from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, side, valve_opening
+from brokk_min.machine import (
+    PWM_MAX,
+    Array,
+    Machine,
+    Measured,
+    by_direction,
+    limit_command,
+    valve_opening,
+)
 
 INTEGRAL_TIME = 4.0  # s, tuned: time constant of the error integral's leak
 ALONG, ACROSS = 0.02, 0.07  # of tool_speed, tuned: velocity errors count up to here
@@ -181,7 +189,7 @@ def command(machine: Machine, action: Array, memory: Memory) -> Array:
     early, late = (round(seconds * machine.rate) for seconds in (EARLY, LATE))
     starts = (memory.open_ticks >= early) & (memory.open_ticks < late)
     a = np.clip(a * np.where(starts, WIDER, 1).astype(a.dtype), -1, 1)
-    zone = side(a, machine.dead_zones[machine.driven])
+    zone = by_direction(a, machine.dead_zones[machine.driven])
     u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
     u[..., machine.driven] = zone * np.clip(a / COMPENSATION, -1, 1)
     u[..., machine.driven] += (machine.pwm_limit / PWM_MAX - zone) * a

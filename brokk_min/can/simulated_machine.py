@@ -13,6 +13,7 @@ from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Array, Frame, checksum
 from brokk_min.can.connection import open_bus, stop_signals
 from brokk_min.machine import Machine
 
+STEP = 0.005  # s, of the plant
 PRE_OPERATIONAL = 127  # NMT state after each NMT command but the start
 Frames = list[tuple[int, bytes]]  # identifiers and data
 
@@ -26,7 +27,7 @@ class SimulatedMachine:
     def __init__(self, machine: Machine, q: ArrayLike, now: float, plant: Plant = PLANT) -> None:
         canopen.check_bus(machine)
         self.machine, self.plant = machine, plant
-        self.fine = replace(machine, rate=1 / machine.plant_dt)  # of which a tick is one step
+        self.fine = replace(machine, rate=1 / STEP)  # of which a tick is one step
         self.state = plant.reset(self.fine, np.array(q, float))
         self.start = now
         self.steps = self.heartbeats = 0
@@ -45,7 +46,7 @@ class SimulatedMachine:
     @property
     def next_step(self) -> float:
         """Time of the next plant step [s]."""
-        return self.start + (self.steps + 1) * self.machine.plant_dt
+        return self.start + (self.steps + 1) * STEP
 
     def advance(self, now: float) -> Frames:
         """Move plant, watchdog and heartbeats on to `now` [s]; frames to send."""

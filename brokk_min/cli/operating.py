@@ -28,7 +28,7 @@ class Simulate(Command):
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped every `plant_dt`.
+    plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped every 5 ms.
 
     def __call__(self, machine: Machine) -> None:
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)

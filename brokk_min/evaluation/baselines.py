@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from brokk_min._files import expect_same, expected, write_json
@@ -56,7 +55,7 @@ def baselines(
     gains = gains or first_gains(machine)
     feedforward = static_map(machine, select_nets(machine, net))
     return {
-        RAW: JacobianController(with_pairs(machine, "dead_zone", 0), gains[RAW], 0.1, w0),
+        RAW: JacobianController(with_dead_zones(machine, 0), gains[RAW], 0.1, w0),
         BY_HAND: JacobianController(machine, gains[BY_HAND], 0.1, w0),
         OPTIMISED: JacobianController(machine, gains[OPTIMISED], 0.1, w0),
         PAPER_BASELINES[1]: JacobianController(machine, gains[OPTIMISED], 0.05, w0),
@@ -71,18 +70,17 @@ def first_gains(machine: Machine, plant: Plant = PLANT) -> dict[str, Any]:
     few = {"kp": 0.2 * n, "ki": 0.5 * n, "kd": 0.02 * n, "feedback": 0.1 * one}
     few |= {"min_opening": 0.015 * one, "integral_feedback": 1.0 * one}
     return {
-        RAW: gains_by_hand(machine, with_pairs(machine, "dead_zone", 0), plant),
+        RAW: gains_by_hand(machine, with_dead_zones(machine, 0), plant),
         BY_HAND: pid,
         OPTIMISED: replace(pid, kd=0.05 * n),
         STRONGEST: StrongGains(**few, start_boost=2.0 * one, start_time=0.26 * one),
     }
 
 
-def with_pairs(machine: Machine, field: str, pairs: ArrayLike) -> Machine:
-    """The machine with other numbers up and down of one field of its joints, as of (n, 2)."""
-    every: Any = map(tuple, np.broadcast_to(pairs, (machine.n, 2)).tolist())
-    rows = zip(machine.joints, every, strict=True)
-    return replace(machine, joints=tuple(replace(joint, **{field: pair}) for joint, pair in rows))
+def with_dead_zones(machine: Machine, zone: float) -> Machine:
+    """The machine with other dead zones, up and down of all joints, of full command."""
+    joints = (replace(joint, dead_zone=(zone, zone)) for joint in machine.joints)
+    return replace(machine, joints=tuple(joints))
 
 
 @dataclass(frozen=True)

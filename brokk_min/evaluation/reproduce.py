@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min._files import write_csv, write_json
-from brokk_min.actuator import PLANT, ActuatorNet, Plant
+from brokk_min.actuator import PLANT, ActuatorNet, Plant, hydraulics
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.identification import fitting, logs
 from brokk_min.identification.excitation import collect
@@ -134,16 +134,20 @@ def measure(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], repo
 
 def variations(machine: Machine) -> dict[str, Machine]:
     """Machines unknown to the controllers, by name; all numbers assumed."""
-    speeds, change = machine.cylinder_speeds, partial(baselines.with_pairs, machine)
+    own = hydraulics(machine)
+
+    def plant_with(**changes: Any) -> Machine:
+        return replace(machine, hydraulics=replace(own, **changes))
+
     return {
         "nominal": machine,
-        "supply flow -70 %": replace(machine, pump_flow=0.3 * machine.pump_flow),
-        "valve gain -20 %": change("cylinder_speed", speeds * 0.8),
-        "valve gain +20 %": change("cylinder_speed", speeds * 1.2),
-        "up -15 %, down +15 %": change("cylinder_speed", speeds * [0.85, 1.15]),
-        "dead zone 5 %": change("dead_zone", 0.05),
-        "dead zone 10 %": change("dead_zone", 0.10),
-        "delay +50 ms": replace(machine, delay=machine.delay + 0.050),
+        "supply flow -70 %": plant_with(pump_flow=0.3 * own.pump_flow),
+        "valve gain -20 %": plant_with(gain=(0.8, 0.8)),
+        "valve gain +20 %": plant_with(gain=(1.2, 1.2)),
+        "up -15 %, down +15 %": plant_with(gain=(0.85, 1.15)),
+        "dead zone 5 %": baselines.with_dead_zones(machine, 0.05),
+        "dead zone 10 %": baselines.with_dead_zones(machine, 0.10),
+        "delay +50 ms": plant_with(delay=own.delay + 0.050),
     }
 
 

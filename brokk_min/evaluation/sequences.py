@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, brief, numbers, read_csv
-from brokk_min.actuator import lever_arm
+from brokk_min.actuator import cylinder_speeds, lever_arm
 from brokk_min.jacobian import dls, limit_weights
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.learning.episodes import draw_goal, draw_hold, draw_pose
@@ -180,7 +180,7 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
     limit = machine.pwm_limit / PWM_MAX * np.array([[1.0], [-1.0]])
     opening = valve_opening(limit, machine.dead_zones)  # up, and down, which is negative
-    up, down = 0.9 * opening * machine.cylinder_speeds.T  # of the cylinders [m/s], (n,) each
+    up, down = 0.9 * opening * cylinder_speeds(machine).T  # of the cylinders [m/s], (n,) each
     for v_goal in goals:
         frames = forward_kinematics(machine, q)
         off = p_goal - tool_position(frames)

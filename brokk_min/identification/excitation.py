@@ -19,6 +19,7 @@ from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encod
 MIX = {"sine": 0.17, "step": 0.1, "holds": 0.17, "start": 0.21, "barely open": 0.35}
 BARELY_OPEN = 0.049  # of full command beyond the dead zone, assumed: the largest of these levels
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
+PAUSE = 2.0  # s, assumed: long enough for an idle valve to close
 
 
 def sine_command(rng: np.random.Generator, machine: Machine, ticks: int) -> Array:
@@ -78,7 +79,7 @@ def _starts(
         ticks = int(rng.uniform(0.1, 1.0) / machine.dt)
         if pauses:
             short = np.exp(rng.uniform(np.log(0.05), np.log(3.0)))
-            seconds = 5 * machine.tau_valve_down if rng.random() < 0.5 else short
+            seconds = PAUSE if rng.random() < 0.5 else short
             parts.append(noise * rng.uniform(-1, 1, int(seconds / machine.dt)))
         else:
             parts.append(_barely_open(rng, machine))

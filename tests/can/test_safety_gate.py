@@ -27,7 +27,7 @@ def tight_machine():
     """The Brokk with ranges such that whole counts hit the gate's borders, and a wide dead zone."""
     margins = [(-0.05, 0.05), (-0.05, 0.05), (0.02, -0.02), (-0.05, -0.02), (0.02, 0.05)]
     joints = [
-        replace(j, q_min=edge(j.q_min, low), q_max=edge(j.q_max, high), cylinder_base=0.0)
+        replace(j, q_min=edge(j.q_min, low), q_max=edge(j.q_max, high))
         for j, (low, high) in zip(BROKK_170.joints, margins, strict=True)
     ]
     joints[4] = replace(joints[4], dead_zone=(0.07, 0.16))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers_bus import Recorder
-from helpers_machines import small_net
+from helpers_machines import coarse, small_net
 
 from brokk_min.actuator import PLANT
 from brokk_min.evaluation import preliminary
@@ -15,7 +15,7 @@ from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
 
 LOW, HIGH = BROKK_170.column("q_min"), BROKK_170.column("q_max")
-COARSE = replace(BROKK_170, plant_dt=0.025)  # two Euler steps a tick: fast
+COARSE = coarse(BROKK_170, 0.025)  # two Euler steps a tick: fast
 
 
 def test_preliminary_tests__move_the_last_driven_joint_at_two_levels():
@@ -70,7 +70,7 @@ def test_sim_to_real__is_between_tools_where_the_arms_end(machine):
 
 
 def test_tests_and_gap__of_another_machine():
-    machine = replace(MINI_EXCAVATOR, plant_dt=0.02)  # two Euler steps a tick: fast
+    machine = coarse(MINI_EXCAVATOR, 0.02)  # two Euler steps a tick: fast
     net = small_net(machine, np.random.default_rng(0))
     tests = preliminary.preliminary_tests(machine, net)
     assert len(tests["range and direction"]) == 4

@@ -8,8 +8,9 @@ from itertools import product
 import numpy as np
 import pytest
 from helpers_cli import run
-from helpers_machines import POSE, Idle, obedient_net, one_by_one, pids, short_axes
+from helpers_machines import POSE, Idle, coarse, obedient_net, one_by_one, pids, short_axes
 
+from brokk_min.actuator import cylinder_speeds, hydraulics
 from brokk_min.evaluation import baselines, metrics, report, reproduce
 from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget
@@ -20,7 +21,7 @@ from brokk_min.identification.net_file import fingerprint, load_net
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
-COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.025)  # four Euler steps a tick: fast
+COARSE = coarse(replace(BROKK_170, rate=10.0), 0.025)  # four Euler steps a tick: fast
 TINY = Budget(0.004, 20, 8192, (1, 1, 2.5), 2, 2.5)
 ERROR = "velocity_error_mean"
 PNG = report.png
@@ -54,8 +55,10 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
     monkeypatch.setattr(reproduce, "QUICK", TINY)
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
     (tmp_path / "m.py").write_text(
-        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
-        "COARSE = replace(BROKK_170, rate=10.0, plant_dt=0.025)\n"
+        "from dataclasses import replace\nfrom brokk_min.actuator import hydraulics\n"
+        "from brokk_min.machine import BROKK_170\n"
+        "h = replace(hydraulics(BROKK_170), dt=0.025)\n"
+        "COARSE = replace(BROKK_170, rate=10.0, hydraulics=h)\n"
     )
     out = tmp_path / "results"
     assert run(f"reproduce --quick --machine '{tmp_path}/m.py:COARSE' --seed 3 --out", out) == 0
@@ -98,13 +101,13 @@ def test_reproduce__results_hold_every_run_and_a_verdict_on_each_sentence(folder
 
 
 def test_variations__change_what_they_say():
-    result, speeds = reproduce.variations(BROKK_170), BROKK_170.cylinder_speeds
+    result, speeds = reproduce.variations(BROKK_170), cylinder_speeds(BROKK_170)
     assert len(result) == 8 and result["nominal"] is BROKK_170
-    assert result["supply flow -70 %"].pump_flow == pytest.approx(0.000315)
-    assert result["delay +50 ms"].delay == pytest.approx(0.09)
+    assert hydraulics(result["supply flow -70 %"]).pump_flow == pytest.approx(0.000315)
+    assert hydraulics(result["delay +50 ms"]).delay == pytest.approx(0.09)
     gains = {"valve gain -20 %": 0.8, "valve gain +20 %": 1.2, "up -15 %, down +15 %": [0.85, 1.15]}
     for name, gain in gains.items():
-        np.testing.assert_allclose(result[name].cylinder_speeds, speeds * gain)
+        np.testing.assert_allclose(cylinder_speeds(result[name]), speeds * gain)
     for name, zone in {"dead zone 5 %": 0.05, "dead zone 10 %": 0.1}.items():
         np.testing.assert_allclose(result[name].dead_zones, np.full((5, 2), zone))
 

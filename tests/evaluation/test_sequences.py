@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brokk_min.actuator import BROKK_CYLINDERS, Hydraulics
 from brokk_min.evaluation import sequences as s
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point
 from brokk_min.machine import BROKK_170
@@ -139,8 +140,9 @@ def follows(start, goals=STILL, machine=BROKK_170):
 
 def test_feasible__refuses_a_path_through_a_singularity():
     """Stretched out straight no joint can move the tool outward: it leaves its path."""
-    wide = [replace(j, cylinder_base=0.0, q_min=-3.0, q_max=4.0) for j in BROKK_170.joints]
-    machine = replace(BROKK_170, joints=tuple(wide))
+    wide = [replace(j, q_min=-3.0, q_max=4.0) for j in BROKK_170.joints]
+    rods = {name: replace(c, base=0.0) for name, c in BROKK_CYLINDERS.items()}
+    machine = replace(BROKK_170, joints=tuple(wide), hydraulics=Hydraulics(rods))
     start = np.array([0.0, 0.5, 0.1, np.pi, 3 * np.pi / 4])
     outward = np.array([np.cos(0.6), 0.0, np.sin(0.6)]) / 5  # along the links after q2
     assert follows(start, np.zeros((5, 1, 3)), machine)

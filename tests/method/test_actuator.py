@@ -1,5 +1,6 @@
 """The plant: its calibration and its equations. The history. The nets against a plain loop."""
 
+import dataclasses
 import math
 from dataclasses import replace
 
@@ -15,15 +16,21 @@ from strategies import machines, poses, reals
 from brokk_min.actuator import (
     PLANT,
     ActuatorNet,
+    Cylinder,
+    Hydraulics,
     PlantState,
     append_command,
     append_sample,
+    cylinder_column,
+    cylinder_speeds,
     estimate_velocity,
+    hydraulics,
     initial_history,
     lever_arm,
 )
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170, Joint, Machine
 
+BROKK = hydraulics(BROKK_170)
 FAST = replace(BROKK_170, rate=200.0)  # a tick is one step of 5 ms
 LIMIT = 80 / 127
 MIDDLE = np.array([0.0, 0.5, 0.5, 1.7, 1.0])
@@ -94,36 +101,89 @@ def test_plant_step__first_moves_at_eleven_counts():
         assert np.all(sign * velocities[-1] > 1e-4)
 
 
+@pytest.mark.parametrize("with_rod", [True, False])
+def test_a_machine_without_hydraulics__moves_as_fast_as_its_joints_say(with_rod):
+    """All numbers of the plant are optional; speeds come from q_dot_up and q_dot_down."""
+    fields = {f.name for f in dataclasses.fields(Joint) if f.default is dataclasses.MISSING}
+    joints = [Joint(**{name: getattr(j, name) for name in fields}) for j in BROKK_170.joints]
+    joints[2] = replace(joints[2], dead_zone=(0.1, 0.02))
+    given = {f.name for f in dataclasses.fields(Machine) if f.default is dataclasses.MISSING}
+    fields = {n: getattr(BROKK_170, n) for n in given} | {"joints": tuple(joints)}
+    rod = Hydraulics({"q3": Cylinder(rod=0.5)})
+    machine = Machine(**fields, hydraulics=rod if with_rod else None)
+    for sign, q_dot in ((1, machine.column("q_dot_up")), (-1, -machine.column("q_dot_down"))):
+        start = machine.column("q_min" if sign > 0 else "q_max")
+        state, u = PLANT.reset(machine, start), np.full(5, sign * 80 / 127)
+        for _ in range(30):
+            last, state = state, PLANT.step(machine, state, u)
+        np.testing.assert_allclose((state.q - last.q) * machine.rate, q_dot, rtol=1e-3)
+
+
+BAD = [
+    ({"cylinder": {"rod": -0.1}}, "q5.rod: expected a positive number, got -0.1"),
+    ({"cylinder": {"angle": 0.0}}, "q5.angle: expected angles in (0, pi), got 0.000 to 2.000"),
+    ({"cylinder": {"angle": 1.2}}, "q5.angle: expected angles in (0, pi), got 1.200 to 3.200"),
+    ({"dt": 0.02}, "hydraulics.dt: expected a whole part of 1/rate, not above any tau, got 0.02"),
+    ({"rate": 30.0}, "hydraulics.dt: expected a whole part of 1/rate, not above any tau"),
+    *(
+        ({tau: 0.004}, "hydraulics.dt: expected a whole part of 1/rate, not above any tau")
+        for tau in ("tau_spool", "tau_cylinder", "tau_valve_up", "tau_valve_down")
+    ),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_hydraulics__that_cannot_be_are_refused_by_name_before_anything_moves(changes, message):
+    cylinders = dict(BROKK.cylinders)
+    cylinders["q5"] = replace(cylinders["q5"], **changes.pop("cylinder", {}))
+    machine = replace(BROKK_170, rate=changes.pop("rate", 20.0))
+    machine = replace(machine, hydraulics=replace(BROKK, cylinders=cylinders, **changes))
+    with pytest.raises(ValueError) as caught:
+        PLANT.reset(machine, MIDDLE)
+    assert str(caught.value).startswith(message)
+
+
+def test_the_brokk__has_the_hydraulics_of_the_design():
+    h = hydraulics(BROKK_170)
+    assert (h.delay, h.dt, h.tau_spool, h.tau_cylinder) == (0.04, 0.005, 0.03, 0.03)
+    assert (h.tau_valve_up, h.tau_valve_down, h.valve_threshold) == (0.15, 0.4, 0.8)
+    assert h.spool_threshold == 0.01
+    np.testing.assert_array_equal(cylinder_speeds(BROKK_170)[4], [0.0425, 0.0833])
+
+
 # --- the plant's equations ------------------------------------------------------------------------
 
 
 def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[dict[str, float]]:
     """The equations read line by line: one joint, one 5 ms step, one number at a time."""
-    m, dt = machine, machine.plant_dt
+    m, h = machine, hydraulics(machine)
+    dt = h.dt
     joints = [{"q": float(a), "v": 0.0, "s": 0.0, "z": 0.0} for a in q]
-    per_tick, late = round(1 / m.rate / dt), round(m.delay / dt)
+    per_tick, late = round(1 / m.rate / dt), round(h.delay / dt)
     for step in range(len(commands) * per_tick):
         at = step - late
         a = [0.0] * m.n if at < 0 else commands[at // per_tick].tolist()
         goal = []
         for joint, x in zip(m.joints, joints, strict=True):
-            part = min(max(0.0, (x["z"] - m.valve_threshold) / (1 - m.valve_threshold)), 1.0)
-            K = joint.cylinder_speed[0 if x["s"] > 0 else 1]
+            part = min(max(0.0, (x["z"] - h.valve_threshold) / (1 - h.valve_threshold)), 1.0)
+            K = h.cylinders[joint.name].speed[0 if x["s"] > 0 else 1]
             goal.append(K * x["s"] * math.sqrt(3 * part**2 - 2 * part**3))
-        flow = sum(abs(j.cylinder_area * v) for j, v in zip(m.joints, goal, strict=True))
-        pump = 1.0 if flow == 0 else min(1.0, m.pump_flow / flow)
+        areas = [h.cylinders[joint.name].area for joint in m.joints]
+        flow = sum(abs(area * v) for area, v in zip(areas, goal, strict=True))
+        pump = 1.0 if flow == 0 else min(1.0, h.pump_flow / flow)
         for i, (joint, x) in enumerate(zip(m.joints, joints, strict=True)):
             zone = joint.dead_zone[0 if a[i] > 0 else 1]
             us = math.copysign(max(0.0, (abs(a[i]) - zone) / (1 - zone)), a[i])
-            zt = 1.0 if abs(x["s"]) > m.spool_threshold else 0.0
-            tau = m.tau_valve_up if zt > x["z"] else m.tau_valve_down
-            b, r, gamma = joint.cylinder_base, joint.cylinder_rod, joint.cylinder_angle + x["q"]
+            zt = 1.0 if abs(x["s"]) > h.spool_threshold else 0.0
+            tau = h.tau_valve_up if zt > x["z"] else h.tau_valve_down
+            cylinder = h.cylinders[joint.name]
+            b, r, gamma = cylinder.base, cylinder.rod, cylinder.angle + x["q"]
             if b:
                 r *= b * math.sin(gamma) / math.sqrt(b * b + r * r - 2 * b * r * math.cos(gamma))
             new = {
                 "q": x["q"] + dt * x["v"] / r,
-                "v": x["v"] + dt * (goal[i] * pump - x["v"]) / m.tau_cylinder,
-                "s": x["s"] + dt * (us - x["s"]) / m.tau_spool,
+                "v": x["v"] + dt * (goal[i] * pump - x["v"]) / h.tau_cylinder,
+                "s": x["s"] + dt * (us - x["s"]) / h.tau_spool,
                 "z": x["z"] + dt * (zt - x["z"]) / tau,
             }
             if new["q"] >= joint.q_max:
@@ -160,7 +220,7 @@ def test_plant_step__is_its_equations(case):
 @given(driven_machines())
 def test_lever_arm__is_the_derivative_of_the_cylinder_length(case):
     machine, q, _ = case
-    base, rod, angle = (machine.column(f"cylinder_{name}") for name in ("base", "rod", "angle"))
+    base, rod, angle = (cylinder_column(machine, name) for name in ("base", "rod", "angle"))
     length = lambda x: np.sqrt((base - rod * np.cos(x)) ** 2 + (rod * np.sin(x)) ** 2)  # noqa: E731
     slope = (length(angle + q + 1e-6) - length(angle + q - 1e-6)) / 2e-6
     np.testing.assert_allclose(lever_arm(machine, q), np.where(base > 0, slope, rod), atol=1e-8)

@@ -1,6 +1,5 @@
 """The machine as a value, the PWM code, the command limit, dead zones, encoders."""
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from strategies import machines, posed
 
-from brokk_min.actuator import PLANT
 from brokk_min.machine import (
     BROKK_170,
-    Joint,
-    Machine,
     decode_pwm,
     encode_pwm,
     limit_command,
@@ -43,22 +39,12 @@ BAD = [
     ({"joint": 3, "q_max": 0.6}, "q4.q_max: expected above 0.6, got 0.6"),
     ({"joint": 3, "q_min": NAN}, "q4.q_max: expected above nan, got 2.9"),
     ({"joint": 3, "dead_zone": 0.1}, "q4.dead_zone: expected a pair, up and down, got 0.1"),
-    ({"joint": 2, "cylinder_speed": 0.1}, "q3.cylinder_speed: expected a pair, up and down, got"),
     ({"joint": 3, "kind": "screw"}, "q4.kind: expected revolute or prismatic, got screw"),
     ({"joint": 2, "q_dot_up": 0.0}, "q3.q_dot_up: expected a positive number, got 0.0"),
-    ({"joint": 2, "cylinder_rod": -0.1}, "q3.cylinder_rod: expected a positive number, got -0.1"),
-    ({"joint": 4, "cylinder_angle": 0.0}, "q5.cylinder_angle: expected angles in (0, pi), got 0.0"),
-    ({"joint": 4, "q_max": np.pi - 0.4}, "q5.cylinder_angle: expected angles in (0, pi), got 0.4"),
     ({"joint": 4, "dead_zone": (0.07, 80 / 127)}, "dead_zone: expected 0 to 80/127, got [[0.07"),
     ({"joint": 4, "dead_zone": (-0.01, 0.07)}, "dead_zone: expected 0 to 80/127, got [[0.07"),
     ({"pwm_limit": 8}, "dead_zone: expected 0 to 8/127, got [[0.07"),
     ({"pwm_limit": 128}, "pwm_limit: expected 1 to 127, got 128"),
-    ({"plant_dt": 0.02}, "plant_dt: expected a whole part of 1/rate, not above any tau, got 0.02"),
-    ({"rate": 30.0}, "plant_dt: expected a whole part of 1/rate, not above any tau, got 0.005"),
-    *(
-        ({tau: 0.004}, "plant_dt: expected a whole part of 1/rate, not above any tau")
-        for tau in ("tau_spool", "tau_cylinder", "tau_valve_up", "tau_valve_down")
-    ),
     ({"history": 3}, "velocity_samples: expected 2 to history, got 4"),
     ({"velocity_samples": 1}, "velocity_samples: expected 2 to history, got 1"),
     ({"q_start": (0.0, 1.0)}, "q_start: expected 5 angles within their ranges, got (0.0, 1.0)"),
@@ -79,37 +65,17 @@ def test_a_bad_field__is_refused_by_name_with_wanted_and_got(changes, message):
 )
 def test_values__at_the_ends_of_the_allowed_ranges_are_machines(limit, samples, q_start):
     fields = {"pwm_limit": limit, "velocity_samples": samples, "q_start": q_start}
-    fields |= {"tau_spool": 0.005, "valve_threshold": 0.0, "delay": 0.0}
     machine = changed(**fields)
     assert {name: getattr(machine, name) for name in fields} == fields
-
-
-def test_a_machine_without_hydraulics__moves_as_fast_as_its_joints_say():
-    """All numbers of the plant are optional; speeds come from q_dot_up and q_dot_down."""
-    fields = {f.name for f in dataclasses.fields(Joint) if f.default is dataclasses.MISSING}
-    joints = [Joint(**{name: getattr(j, name) for name in fields}) for j in BROKK_170.joints]
-    joints[2] = replace(joints[2], dead_zone=(0.1, 0.02), cylinder_rod=0.5)
-    given = {f.name for f in dataclasses.fields(Machine) if f.default is dataclasses.MISSING}
-    machine = Machine(**{n: getattr(BROKK_170, n) for n in given} | {"joints": tuple(joints)})
-    for sign, q_dot in ((1, machine.column("q_dot_up")), (-1, -machine.column("q_dot_down"))):
-        start = machine.column("q_min" if sign > 0 else "q_max")
-        state, u = PLANT.reset(machine, start), np.full(5, sign * 80 / 127)
-        for _ in range(30):
-            last, state = state, PLANT.step(machine, state, u)
-        np.testing.assert_allclose((state.q - last.q) * machine.rate, q_dot, rtol=1e-3)
 
 
 def test_the_brokk__has_the_numbers_of_the_paper_and_the_design():
     m = BROKK_170
     assert (m.rate, m.dt, m.pwm_limit, m.history) == (20.0, 0.05, 80, 13)
-    assert (m.delay, m.plant_dt, m.tau_spool, m.tau_cylinder) == (0.04, 0.005, 0.03, 0.03)
-    assert (m.tau_valve_up, m.tau_valve_down, m.valve_threshold) == (0.15, 0.4, 0.8)
-    assert m.spool_threshold == 0.01
     assert m.names == ("q1", "q2", "q3", "q4", "q5")
     assert m.driven.tolist() == [0, 2, 3, 4] and m.locked.tolist() == [1]
     assert m.column("q_min").tolist() == [-2.14, 0.0, -0.3, 0.6, 0.0]
     assert m.column("q_max").tolist() == [2.14, 1.4, 1.6, 2.9, 2.0]
-    np.testing.assert_array_equal(m.cylinder_speeds[4], [0.0425, 0.0833])
     assert m.encoder_step == pytest.approx(np.full(5, 1.534e-3), abs=5e-7)  # 12 bits
 
 
