@@ -21,11 +21,12 @@ from benchmarks import POLICY, ladder
 from brokk_min import jacobian, kinematics, machine
 from brokk_min.actuator import PLANT, estimate_velocity
 from brokk_min.beyond import interface
+from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.env import terminated
 from brokk_min.evaluation import preliminary, sequences
 from brokk_min.evaluation.baselines import OPTIMISED, read_gains
 from brokk_min.evaluation.rollout import rollout
-from brokk_min.identification import excitation
+from brokk_min.fit import SINE, collect
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy
 from brokk_min.learning.recipes import find_recipe
@@ -93,12 +94,12 @@ def d9() -> Figures:
 def levels() -> Figures:
     """Fractions of samples: in the dead zone, and about the threshold of the valves."""
     result = {}
-    for kind in ("sine", "rich"):
-        log = excitation.collect(M, 0.5, kind, np.random.default_rng(0))
+    for kind in (SINE, RICH):
+        log = collect(M, 0.5, np.random.default_rng(0), excitation=kind)
         size = np.concatenate([np.abs(r.u).max(axis=1)[M.history :] for r in log.recordings])
         counts = (size * PWM_MAX).round()
-        result[f"{kind}, in the dead zone"] = np.mean(size <= M.dead_zones.min())
-        result[f"{kind}, 8 to 15 counts"] = np.mean((counts >= 8) & (counts <= 15))
+        result[f"{kind.name}, in the dead zone"] = np.mean(size <= M.dead_zones.min())
+        result[f"{kind.name}, 8 to 15 counts"] = np.mean((counts >= 8) & (counts <= 15))
     return result
 
 

@@ -21,11 +21,12 @@ import tyro
 import benchmarks  # noqa: F401, before NumPy computes: one thread
 from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet
+from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.evaluation import baselines, metrics, sequences
 from brokk_min.evaluation.reproduce import QUICK, Budget, Chain, fit_net, train
 from brokk_min.evaluation.rollout import TITLES
+from brokk_min.fit import Log, collect
 from brokk_min.identification import inspection, logs, validation
-from brokk_min.identification.excitation import collect, task_log
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, load_policy
@@ -60,12 +61,12 @@ class Options:
     quick: bool = False  # Tiny fits, trainings and tunings: only to show that it runs.
 
 
-def record(chain: Chain) -> tuple[logs.Log, logs.Log]:
+def record(chain: Chain) -> tuple[Log, Log]:
     """The log that nets are fitted to, one joint at a time, and that of a task to score them."""
     rng, read = np.random.default_rng, []
-    recorders: dict[str, Callable[[], logs.Log]] = {
-        "log": lambda: collect(M, chain.budget.hours, "rich", rng(chain.seed), PLANT),
-        "log_test": lambda: task_log(M, 20, 40.0, rng(chain.seed + 1), plant=PLANT),
+    recorders: dict[str, Callable[[], Log]] = {
+        "log": lambda: collect(M, chain.budget.hours, rng(chain.seed), PLANT, RICH),
+        "log_test": lambda: validation.task_log(M, 20, 40.0, rng(chain.seed + 1), plant=PLANT),
     }
     for name, recorder in recorders.items():
         file = chain.out / f"{name}.npz"
@@ -75,7 +76,7 @@ def record(chain: Chain) -> tuple[logs.Log, logs.Log]:
     return read[0], read[1]
 
 
-def nets(chain: Chain, log: logs.Log) -> ActuatorNet:
+def nets(chain: Chain, log: Log) -> ActuatorNet:
     """The nets of all joints."""
     file = chain.out / "net.npz"
     return load_net(file) if file.exists() else fit_net(chain, "net", log, {})
@@ -130,7 +131,7 @@ def table(runs: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def free_runs(net: ActuatorNet, test: logs.Log) -> dict[str, float]:
+def free_runs(net: ActuatorNet, test: Log) -> dict[str, float]:
     """Error of each driven joint's velocity in free runs of `AFTER` s, by its rms speed."""
     scores = validation.score(net, logs.in_order(test, net.joints))
     runs = {M.names[i]: scores[M.names[i]]["free_run"][str(AFTER)] for i in M.driven}

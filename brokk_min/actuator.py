@@ -270,8 +270,6 @@ class ActuatorNet:
     input_scale: Array  # (n, I)
     output_low: Array  # (n,) rad/s
     output_high: Array  # (n,) rad/s
-    q_low: Array  # (n,) rad, smallest angle of the training log
-    q_high: Array  # (n,) rad
     weights: tuple[Array, ...]
     training: Mapping[str, Any]  # seed and settings that made it
 

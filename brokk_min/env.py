@@ -1,8 +1,8 @@
 """The task: follow a tool velocity with the driven joints. Pure functions for any batch.
 
-With nets as the plant these functions are the simulation; with another plant they are the machine.
-`learning.episodes` draws starts and goals. The numbers below are of the Brokk 170, which has 4
-driven joints and 1 locked joint; its history has H = 13 samples.
+`reset` begins an episode and `step` is one tick (Fig. 3 and 4). With nets as the plant these are
+the simulation; with another plant they are the machine. The numbers below are of the Brokk 170,
+which has 4 driven joints and 1 locked joint; its history has H = 13 samples.
 
 | Num     | Observation                                          | Deviation   | Noise |
 |---------|------------------------------------------------------|-------------|-------|
@@ -21,7 +21,6 @@ Start: at rest in a random pose, with a random goal that changes now and then.
 End: terminated, without reward, if the episode starts with a link in the ground; truncated after
 20 s.
 
-An `Interface` is what an agent reads, does and is paid for. The defaults are the paper's.
 """
 
 from __future__ import annotations
@@ -39,6 +38,9 @@ from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, too
 from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, read_encoder
 from brokk_min.settings import TaskConfig
 
+Bools = NDArray[np.bool_]
+Rng = np.random.Generator
+DIRECTIONS = np.vstack([np.eye(3), -np.eye(3)])  # along the axes, both ways
 DRAWS = 4096  # poses and goals on which deviations are measured
 COMMAND_STD = 0.4  # of the largest command; runs of PIDs and policies had 0.30 to 0.43
 
@@ -62,12 +64,17 @@ def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
     return np.full(3, v.std()), np.maximum(q_dot.std(axis=0), 0.05 * machine.q_dot_max)
 
 
-@lru_cache
-def observation_table(machine: Machine) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Of each number observed its mean, deviation, and whether sensors measure it, (obs,) each.
+class Scale(NamedTuple):
+    """Of each number observed its mean, its deviation, and do sensors measure it? (obs,) each."""
 
-    Angles are uniform over their range. Paper: Sec. 3.4 (normalisation)
-    """
+    mean: Array
+    std: Array
+    measured: Bools
+
+
+@lru_cache
+def observation_table(machine: Machine) -> Scale:
+    """The table above in numbers; angles are uniform over their range. Paper: Sec. 3.4"""
     H = machine.history
     q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
     q_std = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
@@ -77,8 +84,8 @@ def observation_table(machine: Machine) -> tuple[Array, Array, NDArray[np.bool_]
     for j in machine.driven:
         rows += [(q_mean[j], q_std[j], 1.0)] * H + [(0.0, q_dot_std[j], 1.0)] * H
     rows += [(0.0, COMMAND_STD * machine.pwm_limit / PWM_MAX, 0.0)] * H * len(machine.driven)
-    mean, std, noisy = np.array(rows, np.float32).T
-    return mean, std, noisy == 1
+    mean, std, measured = np.array(rows, np.float32).T
+    return Scale(mean, std, measured == 1)
 
 
 def measure(
@@ -93,8 +100,8 @@ def measure(
     """
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
-    _, std, noisy = observation_table(machine)
-    error = np.asarray(noise * std[noisy])
+    scale = observation_table(machine)
+    error = np.asarray(noise * scale.std[scale.measured])  # in the order of the table's noisy rows
     v_error, q_error, history_error = np.split(error, [3, 3 + len(machine.locked)], axis=-1)
     q[..., machine.locked] += q_error
     driven[..., :2, :] += history_error.reshape(*error.shape[:-1], -1, 2, machine.history)
@@ -110,8 +117,8 @@ def features(machine: Machine, measured: Measured) -> Array:
     u = measured.history[..., 2, :].reshape(shape)
     q_locked = measured.q[..., machine.locked]
     numbers = [measured.v_goal, measured.v_tool, q_locked, angles_and_velocities, u]
-    mean, std, _ = observation_table(machine)
-    return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / std
+    scale = observation_table(machine)
+    return (np.concatenate(numbers, axis=-1, dtype=np.float32) - scale.mean) / scale.std
 
 
 def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
@@ -132,29 +139,32 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
     return limit_command(machine, u)
 
 
-@dataclass(frozen=True)
 class Interface:
-    """What an agent reads, does and is paid for; the defaults are the paper's.
+    """What an agent reads, does and is paid for: the paper's. A subclass may do it otherwise.
 
-    `memory` is what the agent keeps from tick to tick. At the start of an episode it is None; the
-    paper's agent keeps nothing. Each tick calls `remember`, `observe` and `command`; after the
-    transition `cost` gets the memory of the next tick. `learning.gym_env` takes the cost off eq2.
-    The fields are functions, not methods.
+    `memory` is what an agent keeps from tick to tick, None before the first. In each tick it
+    remembers, observes and commands; once the machine has moved, `cost` is taken off the reward.
     """
 
-    scale: Callable[[Machine], tuple[Array, Array]] = (  # mean, deviation
-        lambda machine: observation_table(machine)[:2]
-    )
-    remember: Callable[[Machine, Any, Measured], Any] = lambda machine, memory, measured: None
-    observe: Callable[[Machine, Measured, Any], Array] = lambda machine, measured, memory: features(
-        machine, measured
-    )
-    command: Callable[[Machine, Array, Any], Array] = lambda machine, action, memory: action_to_pwm(
-        machine, action
-    )
-    cost: Callable[[Machine, Array, Array, Any], Array | float] = (  # of u after u_before
-        lambda machine, u, u_before, memory: 0.0
-    )
+    def scale(self, machine: Machine) -> tuple[Array, Array]:
+        """Mean and deviation of each number observed, float32 (obs,) both."""
+        return observation_table(machine)[:2]
+
+    def remember(self, machine: Machine, memory: Any, measured: Measured) -> Any:
+        """The memory of this tick; the paper's agent keeps nothing."""
+        return None
+
+    def observe(self, machine: Machine, measured: Measured, memory: Any) -> Array:
+        """The observation, float32 (..., obs)."""
+        return features(machine, measured)
+
+    def command(self, machine: Machine, action: Array, memory: Any) -> Array:
+        """Commands u [-1, 1] (..., n) of actions (..., n_driven)."""
+        return action_to_pwm(machine, action)
+
+    def cost(self, machine: Machine, u: Array, u_before: Array, memory: Any) -> Array | float:
+        """What is taken off the reward (...) for `u` after `u_before`; in the paper nothing."""
+        return 0.0
 
 
 PAPER = Interface()
@@ -216,19 +226,149 @@ def reward(v_goal: Array, v_tool: Array) -> Array:
     return np.asarray(1 / (1 + np.linalg.norm(v_goal - v_tool, axis=-1)))
 
 
-def terminated(machine: Machine, lowest: Array) -> NDArray[np.bool_]:
+def terminated(machine: Machine, lowest: Array) -> Bools:
     """Is a link in the ground? `lowest` [m] (...) is `kinematics.lowest_point`. Paper: Sec. 3.4"""
     return np.asarray(lowest < machine.ground)
 
 
-def step(
-    machine: Machine, config: TaskConfig, plant: Plant, state: State, u: Array
-) -> tuple[State, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """One tick under commands `u` (num, n) of `num` machines, without new goals or resets.
+# --- episodes of many machines --------------------------------------------------------------------
 
-    Next state; reward, terminated, truncated (num,).
+
+def draw_pose(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
+    """Random angles within the joints' ranges [rad] (num, n); some have a link in the ground."""
+    return rng.uniform(machine.column("q_min"), machine.column("q_max"), (num, machine.n))
+
+
+def draw_goal(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
+    """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed."""
+    direction = rng.standard_normal((num, 3))
+    kind = rng.random((num, 1))
+    axis = DIRECTIONS[rng.integers(0, 6, num)]
+    direction = np.where(kind < config.zero_goals + config.axis_goals, axis, direction)
+    speed = rng.uniform(0, machine.tool_speed, (num, 1)) * (kind >= config.zero_goals)
+    return np.asarray(speed * direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+
+
+def draw_hold(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> NDArray[np.int64]:
+    """Random numbers of ticks for which a goal holds, (num,)."""
+    low = max(1, round(config.hold_min_s * machine.rate))
+    high = max(1, round(config.hold_max_s * machine.rate))
+    return rng.integers(low, high + 1, num)
+
+
+def draw_noise(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
+    """Uniform noise of `measure` [deviations], float32 (num, noisy). Paper: Sec. 3.4 (5 %)"""
+    size = observation_table(machine).measured.sum()
+    return np.float32(config.noise) * (2 * rng.random((num, size), np.float32) - 1)
+
+
+class Episodes(NamedTuple):
+    """Machines and their agents in the middle of episodes, (num, ...)."""
+
+    state: State
+    memory: Any  # of the agents, see `Interface`
+    obs: Array  # what they read next, float32 (num, obs)
+
+
+Draw = Callable[[Machine, TaskConfig, Rng, int], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is simulated. A subclass may let machines share draws and ends."""
+
+    machine: Machine
+    plant: Plant
+    config: TaskConfig
+    interface: Interface
+
+    def draw(self, what: Draw, rng: Rng, num: int) -> NDArray[Any]:
+        """Random poses, goals, holds or noise of `num` machines, as one of the functions above."""
+        return what(self.machine, self.config, rng, num)
+
+    def ends(self, state: State) -> tuple[Bools, Bools]:
+        """Terminated: the episode began in the ground; truncated: its time is over. (num,)"""
+        end = terminated(self.machine, state.lowest) & (state.ticks == 1)
+        return end, (state.ticks >= round(self.config.episode_s * self.machine.rate)) & ~end
+
+
+def reset(task: Task, rng: Rng, num: int) -> Episodes:
+    """`num` machines at rest in random poses, with random goals. Paper: Sec. 3.4"""
+    pose, goal, hold = (task.draw(what, rng, num) for what in (draw_pose, draw_goal, draw_hold))
+    state = initial_state(task.machine, pose, goal, task.plant)._replace(goal_ticks=hold)
+    return look(task, rng, state, None)
+
+
+def look(task: Task, rng: Rng, state: State, memory: Any) -> Episodes:
+    """What the agents remember and observe of a state, with fresh noise. Paper: Fig. 3"""
+    noise = task.draw(draw_noise, rng, len(state.q))
+    measured = measure(task.machine, state.history, state.v_goal, noise)
+    memory = task.interface.remember(task.machine, memory, measured)
+    return Episodes(state, memory, task.interface.observe(task.machine, measured, memory))
+
+
+def new_goals(task: Task, rng: Rng, state: State) -> State:
+    """New goals where the time of a goal is over."""
+    rows = np.flatnonzero(state.goal_ticks <= 0)
+    if not len(rows):
+        return state
+    v_goal, goal_ticks = state.v_goal.copy(), state.goal_ticks.copy()
+    v_goal[rows] = task.draw(draw_goal, rng, len(rows))
+    goal_ticks[rows] = task.draw(draw_hold, rng, len(rows))
+    return state._replace(v_goal=v_goal, goal_ticks=goal_ticks)
+
+
+def tick(
+    task: Task, rng: Rng, before: Episodes, actions: Array
+) -> tuple[Episodes, Array, Bools, Bools, dict[str, Any]]:
+    """One tick under actions (num, n_driven); episodes that end are not begun anew.
+
+    Returns the next episodes; reward, terminated, truncated (num,); and the velocity error [m/s]
+    and whether the goal has changed since.
     """
-    state = transition(machine, plant, state, u)
-    end = terminated(machine, state.lowest) & (state.ticks == 1)  # a start in the ground
-    truncated = (state.ticks >= round(config.episode_s * machine.rate)) & ~end
-    return state, np.where(end, 0.0, reward(state.v_goal, state.v_tool)), end, truncated
+    m, interface, u_before = task.machine, task.interface, before.state.history[..., 2, -1]
+    u = interface.command(m, actions, before.memory)
+    state = transition(m, task.plant, before.state, u)
+    after = look(task, rng, new_goals(task, rng, state), before.memory)
+    end, truncated = task.ends(state)
+    earned = reward(state.v_goal, state.v_tool) - interface.cost(m, u, u_before, after.memory)
+    error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
+    info = {"velocity_error": error, "new_goal": state.goal_ticks <= 0}
+    return after, np.where(end, 0.0, earned), end, truncated, info
+
+
+def step(
+    task: Task, rng: Rng, before: Episodes, actions: Array
+) -> tuple[Episodes, Array, Bools, Bools, dict[str, Any]]:
+    """A `tick`, then new episodes where some have ended: same-step resets. Paper: Fig. 4
+
+    Their own last observations are in the dictionary as `final_obs`.
+    """
+    after, earned, end, truncated, info = tick(task, rng, before, actions)
+    if (ended := end | truncated).any():
+        info |= {"final_obs": after.obs, "_final_obs": ended}
+        after = restart(task, rng, after, ended)
+    return after, earned, end, truncated, info
+
+
+def restart(task: Task, rng: Rng, episodes: Episodes, ended: Bools) -> Episodes:
+    """New episodes where some have `ended` (num,); the others go on."""
+    rows = np.flatnonzero(ended)
+
+    def replaced(old: Array, new: Array) -> Array:
+        result = np.array(old)
+        result[rows] = new
+        return result
+
+    result: Episodes = map_arrays(replaced, episodes, reset(task, rng, len(rows)))
+    return result
+
+
+def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
+    """`function` of all arrays in `Episodes`, a memory or a plant's state: tuples of arrays."""
+    if first is None:
+        return None
+    if isinstance(first, tuple):
+        values = [map_arrays(function, *row) for row in zip(first, *others, strict=True)]
+        return first._make(values) if hasattr(first, "_make") else tuple(values)
+    return function(first, *others)

@@ -9,10 +9,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import PWM_MAX, Array, Machine, Measured, limit_command, valve_command
+
+DERIVATIVE_TIME = 7 / 60  # s, assumed: time constant of the filter of the PIDs' derivative
 
 
 def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False) -> Array:
@@ -101,6 +103,18 @@ class PIDState(NamedTuple):
     q_dot_goal: Array  # desired joint velocities of the last tick [rad/s]
 
 
+def pid(gains: Gains, error: Array, state: PIDState, dt: float) -> tuple[Array, PIDState]:
+    """Valve openings (..., n_driven) for velocity errors [rad/s], and the state of the next tick.
+
+    x = kp e + ki integral(e) + kd d, where the derivative is filtered: T d' + d = de/dt.
+    """
+    keep, take = (time / (DERIVATIVE_TIME + dt) for time in (DERIVATIVE_TIME, dt))
+    derivative = keep * state.derivative + take * (error - state.error) / dt
+    opening = gains.kp * error + state.integral + gains.kd * derivative
+    integral = state.integral + gains.ki * error * dt
+    return opening, state._replace(integral=integral, error=error, derivative=derivative)
+
+
 @dataclass(frozen=True)
 class JacobianController:
     """Resolved rates by damped least squares (eq3), then one PID per driven joint.
@@ -138,18 +152,20 @@ class JacobianController:
 
     def __call__(self, measured: Measured, state: PIDState) -> tuple[Array, PIDState]:
         """Commands u [-1, 1] (..., n), and the state of the next tick."""
-        m, gains = self.machine, self.gains
         e = measured.v_goal - measured.v_tool
-        v = measured.v_goal + gains.feedback * e  # x_goal + K e
+        v = measured.v_goal + self.gains.feedback * e  # x_goal + K e
         q_dot_goal = self.joint_velocities(v, measured.q.astype(float), state.q_dot_goal)
         error = q_dot_goal - measured.q_dot
-        derivative = 0.7 * state.derivative + 0.3 * (error - state.error) / m.dt  # filtered
-        opening = gains.kp * error + state.integral + gains.kd * derivative  # PID
+        opening, after = pid(self.gains, error, state, self.machine.dt)
         u = self.command(opening)
-        full = np.abs(np.rint(u[..., m.driven] * PWM_MAX)) >= m.pwm_limit
-        saturated = full & (np.sign(opening) == np.sign(error))
-        integral = state.integral + np.where(saturated, 0.0, gains.ki * error * m.dt)  # anti-windup
-        return u, PIDState(integral, error, derivative, q_dot_goal)
+        frozen = self.saturated(u, opening, error)
+        integral = np.where(frozen, state.integral, after.integral)  # anti-windup
+        return u, after._replace(integral=integral, q_dot_goal=q_dot_goal)
+
+    def saturated(self, u: Array, opening: Array, error: Array) -> NDArray[np.bool_]:
+        """Where a command is at its limit and the error would raise it further, (..., n_driven)."""
+        full = np.abs(u[..., self.machine.driven]) >= self.machine.pwm_limit / PWM_MAX
+        return np.asarray(full & (np.sign(opening) == np.sign(error)))
 
     def command(self, opening: Array) -> Array:
         """Commands u (..., n) that open the valves of the driven joints so far (..., n_driven)."""

@@ -3,7 +3,7 @@
 It trains on a Gymnasium vector environment with Box spaces that resets in the same step. A
 truncated episode did not fail: its return goes on with the value of its own last observation. At a
 termination it stops. Advantages come from a critic, as in the paper; `train` also accepts another
-advantage function.
+advantage function. `python -m brokk_min.ppo` trains an agent on a task of Gymnasium.
 Names follow CleanRL's where they can; target_kl steers the learning rate. Paper: Sec. 3.4
 """
 
@@ -13,9 +13,12 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import torch
+import tyro
 from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import Tensor, nn
 
 from brokk_min.settings import PPOConfig
@@ -71,7 +74,7 @@ class Rollout(NamedTuple):
     terminated: Tensor
     dones: Tensor  # terminated or truncated
     next_obs: Tensor  # where an episode ended: its own last observation
-    infos: list[dict[str, Any]]  # of `env.step`, tick by tick
+    infos: Any  # of `env.step`, a dictionary a tick
 
 
 class Checkpoint(NamedTuple):
@@ -82,6 +85,7 @@ class Checkpoint(NamedTuple):
     obs: Tensor  # of the next tick, (num_envs, obs)
     global_step: int
     update: int
+    learning_rate: float  # of the next update, before it falls with the steps
 
 
 Advantages = Callable[[Agent, Rollout, PPOConfig], tuple[Tensor, Tensor | None]]
@@ -99,8 +103,7 @@ def collect(
 ) -> tuple[Rollout, Tensor]:
     """`horizon` ticks of all environments from observations (num_envs, obs); and the next ones."""
     space: Any = env.single_action_space
-    ticks: list[tuple[Tensor, ...]] = []
-    infos = []
+    ticks: list[Rollout] = []  # of one tick each
     for _ in range(horizon):
         mean = agent.actor(obs)
         action = mean + agent.log_std.exp() * torch.randn(mean.shape)
@@ -113,12 +116,11 @@ def collect(
         if done.any():
             last_obs[done] = torch.as_tensor(np.stack(info["final_obs"][done])).float()
         rewards = torch.as_tensor(reward).float()
-        flags = torch.as_tensor(terminated), torch.as_tensor(done)
-        ticks.append((obs, action, logprob, rewards, *flags, last_obs))
-        infos.append(info)
+        ended, dones = torch.as_tensor(terminated), torch.as_tensor(done)
+        ticks.append(Rollout(obs, action, logprob, rewards, ended, dones, last_obs, info))
         obs = following
-    tensors = [torch.stack(column) for column in zip(*ticks, strict=True)]
-    return Rollout(*tensors, infos=infos), obs  # type: ignore[misc, arg-type]
+    *columns, infos = zip(*ticks, strict=True)
+    return Rollout._make([*map(torch.stack, columns), infos]), obs
 
 
 def gae(
@@ -192,7 +194,7 @@ def begin(env: VectorEnv[Any, Any, Any], config: PPOConfig, seed: int) -> Checkp
     agent.log_std.requires_grad_(config.log_std_end is None)
     optimizer = torch.optim.Adam(agent.parameters(), lr=config.learning_rate, fused=True)
     obs = torch.as_tensor(env.reset(seed=seed)[0], dtype=torch.float32)
-    return Checkpoint(agent, optimizer, obs, 0, 0)
+    return Checkpoint(agent, optimizer, obs, 0, 0, config.learning_rate)
 
 
 def train(
@@ -210,12 +212,11 @@ def train(
     CleanRL's names. `start` is a checkpoint to go on from, in place of a new agent by `seed`.
     ValueError: a loss that is not finite.
     """
-    agent, optimizer, obs, global_step, update = start or begin(env, config, seed)
-    group = optimizer.param_groups[0]
-    group.setdefault("peak_lr", config.learning_rate)
+    start = start or begin(env, config, seed)
+    agent, optimizer, obs, global_step, update, learning_rate = start
     while global_step < config.total_steps:
         done = global_step / config.total_steps
-        group["lr"] = group["peak_lr"] * (1 - done)
+        optimizer.param_groups[0]["lr"] = learning_rate * (1 - done)
         if config.log_std_end is not None:
             agent.log_std.data.fill_(config.log_std + (config.log_std_end - config.log_std) * done)
         rollout, obs = collect(env, agent, obs, config.horizon)
@@ -249,12 +250,37 @@ def train(
             raise ValueError(f"loss: expected finite numbers at step {global_step}, got {means}")
         metrics = {f"losses/{name}": mean for name, mean in zip(names, means, strict=True)}
         metrics["charts/reward"] = float(rollout.rewards.mean())
-        metrics["charts/learning_rate"] = group["lr"]
+        metrics["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
         # lower the rate after a large change of the policy, raise it after a small one, in the
         # manner of rl_games
         if metrics["losses/approx_kl"] > 1.5 * config.target_kl:
-            group["peak_lr"] /= 1.2
+            learning_rate /= 1.2
         elif metrics["losses/approx_kl"] < 0.7 * config.target_kl:
-            group["peak_lr"] = min(1.2 * group["peak_lr"], config.learning_rate)
-        on_update(Checkpoint(agent, optimizer, obs, global_step, update), rollout, metrics)
+            learning_rate = min(1.2 * learning_rate, config.learning_rate)
+        now = Checkpoint(agent, optimizer, obs, global_step, update, learning_rate)
+        on_update(now, rollout, metrics)
     return agent
+
+
+PENDULUM: dict[str, Any] = {"num_envs": 32, "epochs": 4, "minibatch_size": 256, "gamma": 0.95}
+PENDULUM |= {"learning_rate": 4e-3, "target_kl": 0.3, "log_std": 0.0}
+
+
+def main(
+    task: tyro.conf.Positional[str] = "Pendulum-v1", total_steps: int = 60_000, seed: int = 0
+) -> None:
+    """Train an agent on a task of Gymnasium with continuous actions, and print its mean return."""
+    config = PPOConfig(total_steps, **(PENDULUM if task == "Pendulum-v1" else {}))
+    spec: Any = gymnasium.make(task).spec
+    options = {} if spec.vector_entry_point else {"autoreset_mode": AutoresetMode.SAME_STEP}
+    env = RecordEpisodeStatistics(gymnasium.make_vec(task, config.num_envs, vector_kwargs=options))
+
+    def report(now: Checkpoint, rollout: Rollout, metrics: dict[str, float]) -> None:
+        if env.return_queue:  # of the last hundred episodes
+            print(f"step {now.global_step}: return {np.mean(env.return_queue):.1f}", flush=True)
+
+    train(env, config, seed, on_update=report)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

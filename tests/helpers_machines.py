@@ -8,7 +8,7 @@ from brokk_min.actuator import ActuatorNet, hydraulics
 from brokk_min.beyond.strong_pid import StrongGains
 from brokk_min.env import Measured, measure
 from brokk_min.evaluation import baselines, sequences
-from brokk_min.identification.logs import Recording, velocity_of
+from brokk_min.fit import Recording, velocity_of
 from brokk_min.jacobian import Gains
 from brokk_min.machine import BROKK_170, Machine
 
@@ -50,8 +50,6 @@ def random_net(seed=0, n=3, history=13, rows=3):
         input_scale=rng.uniform(0.1, 2, (n, inputs)).astype(np.float32),
         output_low=rng.uniform(-0.6, -0.1, n).astype(np.float32),
         output_high=rng.uniform(0.1, 0.6, n).astype(np.float32),
-        q_low=np.full(n, -2.0, np.float32),
-        q_high=np.full(n, 2.0, np.float32),
         weights=tuple((rng.standard_normal((n, *s)) / s[0] ** 0.5).astype("f4") for s in sizes),
     )
 
@@ -75,8 +73,6 @@ def small_net(machine, rng, joints=()):
         input_scale=np.tile(spread, (len(joints), 1)),
         output_low=np.float32(-1.1) * fastest,
         output_high=np.float32(1.2) * fastest,
-        q_low=low,
-        q_high=high,
     )
 
 
@@ -103,8 +99,6 @@ def constant_net(velocity, joints, rows=3):
         weights=tuple(np.zeros_like(w) for w in net.weights),
         output_low=middle - 1,
         output_high=middle + 1,
-        q_low=np.full(len(velocity), -1e3, np.float32),
-        q_high=np.full(len(velocity), 1e3, np.float32),
     )
 
 
@@ -157,7 +151,7 @@ def pids(machine, net):
     """All baselines with gains that take no trials."""
     one, n = np.ones(1), np.ones(len(machine.driven))
     pid = Gains(1.0 * n, 8.0 * n, 0.05 * n, 0.4 * one)
-    names = (baselines.RAW, baselines.BY_HAND, *baselines.PAPER_BASELINES)
+    names = (baselines.RAW, baselines.BY_HAND, baselines.OPTIMISED)
     more = 0.015 * one, 1.0 * one, 2.0 * one, 0.26 * one
     strong = StrongGains(0.2 * n, 0.5 * n, 0.02 * n, 0.1 * one, *more)
     return baselines.baselines(

@@ -19,52 +19,65 @@ Who was first: the vine of TRPO (Schulman et al., 2015) branches rollouts from o
 random numbers; RLOO (Kool et al., 2019) takes the mean of a group's others as the baseline, and
 GRPO (Shao et al., 2024) that of the group.
 
-It plugs into `ppo.train` as its advantage function.
+It plugs into `ppo.train` as its advantage function, and around its environment.
 """
 
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import VectorWrapper
+from numpy.typing import NDArray
 from torch import Tensor
 
 from brokk_min import ppo
-from brokk_min.learning.episodes import map_arrays
-from brokk_min.learning.gym_env import Step, TaskVectorEnv
+from brokk_min.env import Bools, Draw, State, Task, map_arrays
 from brokk_min.machine import Array, require
 from brokk_min.settings import PPOConfig
 
 COPIES = 4  # machines in a group; neighbours in each array
-LARGEST = 4.0  # deviations of all advantages, to which they are cut
+CUT = 4.0  # deviations of all advantages, to which they are cut
 
 
-class GroupVectorEnv(TaskVectorEnv):
-    """A `TaskVectorEnv` of groups, which share starts, goals and noise, and end together.
+class GroupTask(Task):
+    """A task whose machines share starts, goals, noise and ends with the others of their group."""
+
+    def draw(self, what: Draw, rng: np.random.Generator, num: int) -> NDArray[Any]:
+        """One draw for each group."""
+        return super().draw(what, rng, num // COPIES).repeat(COPIES, axis=0)
+
+    def ends(self, state: State) -> tuple[Bools, Bools]:
+        """Terminated and truncated (num,), where any of the group is."""
+        ends = np.reshape(super().ends(state), (2, -1, COPIES)).any(axis=-1)
+        terminated, truncated = ends.repeat(COPIES, axis=-1)
+        return terminated, truncated & ~terminated
+
+
+class GroupVectorEnv(VectorWrapper[Any, Any, Any]):
+    """Groups in an environment of `learning.gym_env`; after a window they go on as one of them.
 
     Windows of `horizon` ticks end truncated; their own last observations are in
-    `info["final_obs"]`. ValueError: `num_envs` is no multiple of `COPIES`.
+    `info["final_obs"]`. ValueError: the machines are no multiple of `COPIES`.
     """
 
-    copies = COPIES
-
-    def __init__(self, num_envs: int, *options: Any, horizon: int, **more: Any) -> None:
-        require(num_envs % COPIES == 0, "num_envs", f"a multiple of {COPIES}", num_envs)
-        super().__init__(num_envs, *options, **more)
+    def __init__(self, env: Any, horizon: int) -> None:
+        super().__init__(env)
+        require(env.num_envs % COPIES == 0, "num_envs", f"a multiple of {COPIES}", env.num_envs)
+        self.inner = env.unwrapped
+        self.inner.task = GroupTask(**vars(self.inner.task))
         self.horizon, self.ticks = horizon, 0
 
-    def step(self, actions: Array) -> Step:
+    def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
         """One tick; after the last of a window all of a group go on from one of them."""
-        obs, reward, terminated, truncated, info = super().step(actions)
+        obs, reward, terminated, truncated, info = self.env.step(actions)
         self.ticks += 1
         if self.ticks % self.horizon == 0:
             groups = np.arange(0, self.num_envs, COPIES)
-            rows = (groups + self.np_random.integers(0, COPIES, len(groups))).repeat(COPIES)
+            rows = (groups + self.inner.np_random.integers(0, COPIES, len(groups))).repeat(COPIES)
             info = {"final_obs": obs} | info | {"_final_obs": np.ones_like(terminated)}
             truncated = ~terminated
-            self.state, self.memory, obs = map_arrays(
-                lambda values: values[rows], (self.state, self.memory, obs)
-            )
-        return obs, reward, terminated, truncated, info
+            self.inner.episodes = map_arrays(lambda values: values[rows], self.inner.episodes)
+        return self.inner.episodes.obs, reward, terminated, truncated, info
 
 
 def group_advantages(
@@ -77,5 +90,5 @@ def group_advantages(
     returns = ppo.gae(rollout.rewards, zero, zero, ends, config.gamma, config.gae_lambda)
     groups = returns.reshape(len(returns), -1, COPIES)
     advantages = (groups - groups.mean(dim=-1, keepdim=True)).flatten(1)
-    limit = LARGEST * advantages.std()
+    limit = CUT * advantages.std()
     return advantages.clamp(-limit, limit), None

@@ -19,8 +19,8 @@ Who was first: resolved rates (Whitney, 1969) as inputs are residual or "structu
 many papers; the integral is that of a PI controller; legged_gym has costs of torques and of action
 changes.
 
-It plugs into `env.Interface`. A number x of the observation is weight (x - mean) / deviation; means
-are those of `env`, 0.5 of the indicator, and 0 of the last two rows:
+It plugs in as an `env.Interface`. A number x of the observation is weight (x - mean) / deviation;
+means are those of `env`, 0.5 of the indicator, and 0 of the last two rows:
 
 | Num     | Observation                                          | Deviation   | Weight |
 |---------|------------------------------------------------------|-------------|--------|
@@ -74,21 +74,6 @@ class Memory(NamedTuple):
     error_integral: Array  # leaky integral of the velocity error [m], (..., 3)
     rest_ticks: NDArray[np.int64]  # for which the goal has been zero, (...)
     open_ticks: NDArray[np.int64]  # since a valve was last closed; 0: now, or not in the history
-
-
-def remember(machine: Machine, memory: Memory | None, measured: Measured) -> Memory:
-    """What the agent keeps, with the tool's velocity J q_dot at the time of q_dot.
-
-    The velocity of a joint is the slope through w angles, so it is (w - 1) / 2 ticks old, and J is
-    that of q - (w - 1) / 2 dt q_dot, where the driven joints were then. By the Jacobian of now the
-    velocity would point to one side, to and fro, and the integral would make a drift of that.
-    """
-    q_dot = np.zeros_like(measured.q)
-    q_dot[..., machine.driven] = measured.q_dot
-    age = (machine.velocity_samples - 1) / 2 * machine.dt
-    q = np.stack([measured.q, measured.q - age * q_dot])
-    now, then = tool_velocity(forward_kinematics(machine, q), q_dot)
-    return accumulate(machine, memory, measured._replace(v_tool=measured.v_tool + then - now))
 
 
 def accumulate(machine: Machine, memory: Memory | None, measured: Measured) -> Memory:
@@ -159,55 +144,75 @@ def observation_scale(machine: Machine) -> tuple[Array, Array]:
     return mean, std / weight
 
 
-def observe(machine: Machine, measured: Measured, memory: Memory) -> Array:
-    """The observation of the table above, float32 (..., obs)."""
-    driven = machine.driven
-    q = measured.q.copy()
-    q[..., driven] = smooth_angles(machine, measured.history)
-    J = jacobian(forward_kinematics(machine, q))[..., driven]
-    arm = np.hypot(machine.column("a"), machine.column("d")).sum()
-    J_inv = dls(J, np.ones(len(driven)), (0.06 * arm) ** 2)  # lambda: 6 % of the arm, assumed
-    newest = measured.history[..., -(machine.history // 2) :]
-    q_dot, u = newest[..., 1, :], newest[..., 2, :]
-    opens = open_indicator(opening(u, machine.dead_zones[driven].astype(u.dtype)))
-    shape = (*q.shape[:-1], -1)
-    numbers = [measured.v_goal, memory.v_tool, q[..., machine.locked], q[..., driven]]
-    numbers += [samples.reshape(shape) for samples in (q_dot, u, opens)]
-    numbers += [(J_inv @ v[..., None])[..., 0] for v in (measured.v_goal, memory.error_integral)]
-    mean, scale = observation_scale(machine)
-    return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
+class OurInterface(env.Interface):
+    """What our agent reads, remembers, does and pays."""
+
+    def scale(self, machine: Machine) -> tuple[Array, Array]:
+        """`observation_scale`."""
+        return observation_scale(machine)
+
+    def remember(self, machine: Machine, memory: Memory | None, measured: Measured) -> Memory:
+        """What the agent keeps, with the tool's velocity J q_dot at the time of q_dot.
+
+        The velocity of a joint is the slope through w angles, so it is (w - 1) / 2 ticks old, and J
+        is that of q - (w - 1) / 2 dt q_dot, where the driven joints were then. By the Jacobian of
+        now the velocity would point to one side, to and fro, and the integral would drift by that.
+        """
+        q_dot = np.zeros_like(measured.q)
+        q_dot[..., machine.driven] = measured.q_dot
+        age = (machine.velocity_samples - 1) / 2 * machine.dt
+        q = np.stack([measured.q, measured.q - age * q_dot])
+        now, then = tool_velocity(forward_kinematics(machine, q), q_dot)
+        return accumulate(machine, memory, measured._replace(v_tool=measured.v_tool + then - now))
+
+    def observe(self, machine: Machine, measured: Measured, memory: Memory) -> Array:
+        """The observation of the table above, float32 (..., obs)."""
+        driven = machine.driven
+        q = measured.q.copy()
+        q[..., driven] = smooth_angles(machine, measured.history)
+        J = jacobian(forward_kinematics(machine, q))[..., driven]
+        arm = np.hypot(machine.column("a"), machine.column("d")).sum()
+        J_inv = dls(J, np.ones(len(driven)), (0.06 * arm) ** 2)  # lambda: 6 % of the arm, assumed
+        newest = measured.history[..., -(machine.history // 2) :]
+        q_dot, u = newest[..., 1, :], newest[..., 2, :]
+        opens = open_indicator(opening(u, machine.dead_zones[driven].astype(u.dtype)))
+        shape = (*q.shape[:-1], -1)
+        numbers = [measured.v_goal, memory.v_tool, q[..., machine.locked], q[..., driven]]
+        numbers += [samples.reshape(shape) for samples in (q_dot, u, opens)]
+        wanted = measured.v_goal, memory.error_integral
+        numbers += [(J_inv @ v[..., None])[..., 0] for v in wanted]
+        mean, scale = observation_scale(machine)
+        return (np.concatenate(numbers, axis=-1, dtype=np.float32) - mean) / scale
+
+    def command(self, machine: Machine, action: Array, memory: Memory) -> Array:
+        """u (..., n) = zone clip(a / 0.01, -1, 1) + (limit - zone) a of actions (..., n_driven).
+
+        An action of 0.01 begins to open a valve. A closed valve answers late, so from 0.25 to 0.4 s
+        after it was last closed its action is multiplied by 1.25. Once the goal has been 0 for
+        0.1 s all valves close; until then the agent may brake. Paper: Sec. 3.3
+        """
+        a = np.asarray(action)
+        early, late = (round(seconds * machine.rate) for seconds in (EARLY, LATE))
+        starts = (memory.open_ticks >= early) & (memory.open_ticks < late)
+        a = np.clip(a * np.where(starts, WIDER, 1).astype(a.dtype), -1, 1)
+        zone = by_direction(a, machine.dead_zones[machine.driven])
+        u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
+        u[..., machine.driven] = zone * np.clip(a / COMPENSATION, -1, 1)
+        u[..., machine.driven] += (machine.pwm_limit / PWM_MAX - zone) * a
+        resting = memory.rest_ticks > REST_AFTER * machine.rate
+        return np.where(resting[..., None], 0, limit_command(machine, u))
+
+    def cost(self, machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
+        """0.03 mean (u / limit)^2 + 0.1 mean |u - u_before| / limit + 2 |integral| [m], (...).
+
+        Some motions of more than three joints cancel at the tool. The first term keeps the policy
+        from them, because in the end they push a joint against its stop.
+        """
+        limit = machine.pwm_limit / PWM_MAX
+        effort = np.square(u[..., machine.driven] / limit).mean(axis=-1)
+        travel = np.abs((u - u_before)[..., machine.driven] / limit).mean(axis=-1)
+        integral = np.linalg.norm(memory.error_integral, axis=-1)
+        return np.asarray(EFFORT_COST * effort + TRAVEL_COST * travel + INTEGRAL_COST * integral)
 
 
-def command(machine: Machine, action: Array, memory: Memory) -> Array:
-    """u (..., n) = zone clip(a / 0.01, -1, 1) + (limit - zone) a of actions (..., n_driven).
-
-    An action of 0.01 begins to open a valve. A closed valve answers late, so from 0.25 to 0.4 s
-    after it was last closed its action is multiplied by 1.25. Once the goal has been 0 for 0.1 s
-    all valves close; until then the agent may brake. Paper: Sec. 3.3
-    """
-    a = np.asarray(action)
-    early, late = (round(seconds * machine.rate) for seconds in (EARLY, LATE))
-    starts = (memory.open_ticks >= early) & (memory.open_ticks < late)
-    a = np.clip(a * np.where(starts, WIDER, 1).astype(a.dtype), -1, 1)
-    zone = by_direction(a, machine.dead_zones[machine.driven])
-    u = np.zeros((*a.shape[:-1], machine.n), a.dtype)
-    u[..., machine.driven] = zone * np.clip(a / COMPENSATION, -1, 1)
-    u[..., machine.driven] += (machine.pwm_limit / PWM_MAX - zone) * a
-    resting = memory.rest_ticks > REST_AFTER * machine.rate
-    return np.where(resting[..., None], 0, limit_command(machine, u))
-
-
-def cost(machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
-    """0.03 mean (u / limit)^2 + 0.1 mean |u - u_before| / limit + 2 |integral| [m], (...).
-
-    Some motions of more than three joints cancel at the tool. The first term keeps the policy from
-    them, because in the end they push a joint against its stop.
-    """
-    limit = machine.pwm_limit / PWM_MAX
-    effort = np.square(u[..., machine.driven] / limit).mean(axis=-1)
-    travel = np.abs((u - u_before)[..., machine.driven] / limit).mean(axis=-1)
-    integral = np.linalg.norm(memory.error_integral, axis=-1)
-    return np.asarray(EFFORT_COST * effort + TRAVEL_COST * travel + INTEGRAL_COST * integral)
-
-
-INTERFACE = env.Interface(observation_scale, remember, observe, command, cost)
+INTERFACE = OurInterface()

@@ -20,12 +20,12 @@ import numpy as np
 
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.interface import REST_AFTER, Memory, accumulate, smooth_angles
-from brokk_min.jacobian import Gains, JacobianController, PIDState
+from brokk_min.jacobian import Gains, JacobianController, PIDState, pid
 from brokk_min.machine import PWM_MAX, Array, Machine, Measured, valve_opening
 
 ANGLES = 9  # of the static map, assumed
 COMMANDS = 41  # of the static map, assumed
-State = tuple[PIDState, Memory | None]  # what the controller keeps between ticks
+Kept = tuple[PIDState, Memory | None]  # what the controller keeps between ticks
 
 
 @dataclass(frozen=True)
@@ -94,13 +94,13 @@ class StrongPID(JacobianController):
     gains: StrongGains
     feedforward: StaticMap
 
-    def start(self, num: int) -> State:  # type: ignore[override]
+    def start(self, num: int) -> Kept:  # type: ignore[override]
         """State of `num` controllers at rest."""
         return super().start(num), None
 
     def __call__(  # type: ignore[override]
-        self, measured: Measured, state: State
-    ) -> tuple[Array, State]:
+        self, measured: Measured, state: Kept
+    ) -> tuple[Array, Kept]:
         """Commands u [-1, 1] (..., n), and the state of the next tick."""
         (before, memory), m, gains = state, self.machine, self.gains
         memory = accumulate(m, memory, measured)
@@ -110,17 +110,15 @@ class StrongPID(JacobianController):
         v = v + gains.integral_feedback * memory.error_integral  # v_goal + K e + K_I integral(e)
         q_dot_goal = self.joint_velocities(v, q, before.q_dot_goal)
         error = q_dot_goal - measured.q_dot
-        derivative = 0.7 * before.derivative + 0.3 * (error - before.error) / m.dt
-        opening = gains.kp * error + before.integral + gains.kd * derivative  # PID
+        opening, after = pid(gains, error, before, m.dt)
         steady = self.feedforward.command(q[..., m.driven], q_dot_goal)
         opening = opening + valve_opening(steady, m.dead_zones[m.driven])
         u = self.command(self.widen(opening, measured, memory))
-        full = np.abs(np.rint(u[..., m.driven] * PWM_MAX)) >= m.pwm_limit
-        saturated = full & (np.sign(opening) == np.sign(error))
         closed = (memory.rest_ticks > REST_AFTER * m.rate)[..., None]
-        increase = np.where(saturated | closed, 0.0, gains.ki * error * m.dt)  # anti-windup
-        pid = PIDState(before.integral + increase, error, derivative, q_dot_goal)
-        return np.where(closed, 0.0, u), (pid, memory)
+        frozen = self.saturated(u, opening, error) | closed
+        integral = np.where(frozen, before.integral, after.integral)  # anti-windup
+        after = after._replace(integral=integral, q_dot_goal=q_dot_goal)
+        return np.where(closed, 0.0, u), (after, memory)
 
     def widen(self, opening: Array, measured: Measured, memory: Memory) -> Array:
         """Openings (..., n_driven), wider where a valve starts, at least `min_opening` in motion.

@@ -12,7 +12,7 @@ from brokk_min._files import brief, expected, require_package
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame, Nodes
 from brokk_min.can.connection import plain_frame
-from brokk_min.identification.logs import Log, machine_log
+from brokk_min.fit import Log, machine_log
 from brokk_min.identification.readings import FASTER, NOISE
 from brokk_min.machine import Array, Machine, require
 

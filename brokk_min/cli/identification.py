@@ -13,11 +13,12 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
 from brokk_min._files import expected, write_json
+from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.cli.options import Command, check, check_settings, find_plant
-from brokk_min.identification import columns, excitation, logs
-from brokk_min.identification.fit_config import PAPER_RECIPE, FitConfig
-from brokk_min.identification.logs import Log
+from brokk_min.fit import SINE, Log, collect
+from brokk_min.identification import columns, logs
+from brokk_min.identification.fit_config import PAPER_RECIPE, OurFitConfig
 from brokk_min.identification.net_file import load_net, save_net
 from brokk_min.machine import BROKK_170, Machine, require
 
@@ -38,7 +39,8 @@ class Collect(Command):
         check(0 < self.hours <= 100, "--hours", "above 0, to 100", self.hours)
         self.writes(self.out)
         rng, plant = np.random.default_rng(self.seed), find_plant(self.plant, machine)
-        log = excitation.collect(machine, self.hours, self.excitation, rng, plant)
+        excitation = {"sine": SINE, "rich": RICH}[self.excitation]
+        log = collect(machine, self.hours, rng, plant, excitation)
         logs.write_log(self.out, log)
         print(f"{self.out}: {len(log.recordings)} recordings of {', '.join(log.joints)}")
 
@@ -103,14 +105,14 @@ class Fit(ReadsLogs):
     json: Path | None = None  # Also write the scores here.
     paper: bool = False  # The paper's recipe: errors of one step, commands as they are.
     seed: int = 0  # Of the weights and the drawn windows.
-    settings: OmitArgPrefixes[FitConfig]
+    settings: OmitArgPrefixes[OurFitConfig]
 
     @classmethod
     def defaults(cls, options: list[str]) -> Any:
         """Ours, or the settings of the paper's recipe."""
         recipe, required = PAPER_RECIPE if "--paper" in options else {}, tyro.MISSING
         recipe = recipe | ({"members": 1} if "--no-valve" in options else {})
-        return cls(logs=required, out=required, settings=FitConfig(**recipe))
+        return cls(logs=required, out=required, settings=OurFitConfig(**recipe))
 
     def __call__(self, machine: Machine) -> None:
         from brokk_min.identification import fitting, inspection, validation
@@ -132,7 +134,7 @@ class Fit(ReadsLogs):
         for wrong in inspection.wrong_signs(reports):
             raise ValueError(f"{self.logs[0]}: {wrong}")
         name = known.name if known else ""
-        net = fitting.fit(log, settings, self.seed, machine, name)
+        net = fitting.fit_nets(log, settings, self.seed, machine, name)
         scores = validation.score(net, test)
         warnings = [*validation.warnings(scores), *inspection.warnings(log, reports, known)]
         save_net(self.out, net)

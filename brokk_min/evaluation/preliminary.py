@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from brokk_min.actuator import Plant
-from brokk_min.identification.excitation import task_log
+from brokk_min.identification.validation import task_log
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import PWM_MAX, Array, Machine, encode_pwm
 

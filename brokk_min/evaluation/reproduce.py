@@ -10,9 +10,10 @@ import numpy as np
 
 from brokk_min._files import write_csv, write_json
 from brokk_min.actuator import PLANT, ActuatorNet, Plant, hydraulics
+from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
+from brokk_min.fit import SINE, Excitation, Log, collect
 from brokk_min.identification import fitting, logs
-from brokk_min.identification.excitation import collect
 from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
@@ -29,7 +30,7 @@ class Budget:
     """How much each stage may spend."""
 
     hours: float = 1.0  # driving time of each actuator that is recorded (paper: 1 h)
-    fit_steps: int = fitting.FitConfig.steps
+    fit_steps: int = fitting.OurFitConfig.steps
     train_steps: int | None = None  # None: as many as the recipe has
     tuning: baselines.Effort = baselines.EFFORT
     starts: int = 32
@@ -56,7 +57,7 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     """
     chain = Chain(machine, out, budget, seed)
     out.mkdir(parents=True, exist_ok=True)
-    done = learn(chain, record(chain, "rich", "log"), record(chain, "sine", "log_paper"))
+    done = learn(chain, record(chain, RICH, "log"), record(chain, SINE, "log_paper"))
     results, measured = measure(chain, done)
     write_json(out / "results.json", results)
     write_json(out / "table.json", {key: results[key] for key in ("meta", "table")})
@@ -65,18 +66,18 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     return results
 
 
-def record(chain: Chain, excitation: str, name: str) -> logs.Log:
+def record(chain: Chain, excitation: Excitation, name: str) -> Log:
     """A log to fit nets to, written to `name`.npz and read back as a user's would be."""
     machine, file = chain.machine, chain.out / f"{name}.npz"
     rng = np.random.default_rng(chain.seed)
-    logs.write_log(file, collect(machine, chain.budget.hours, excitation, rng))
+    logs.write_log(file, collect(machine, chain.budget.hours, rng, PLANT, excitation))
     return logs.read_log(file, machine)
 
 
-def fit_net(chain: Chain, name: str, log: logs.Log, recipe: Mapping[str, Any]) -> ActuatorNet:
+def fit_net(chain: Chain, name: str, log: Log, recipe: Mapping[str, Any]) -> ActuatorNet:
     """Nets of all joints by our settings but for those of `recipe`, written to `name`.npz."""
-    config = fitting.FitConfig(**{"steps": chain.budget.fit_steps, **recipe})
-    net = fitting.fit(log, config, chain.seed, chain.machine, chain.machine.name)
+    config = fitting.OurFitConfig(**{"steps": chain.budget.fit_steps, **recipe})
+    net = fitting.fit_nets(log, config, chain.seed, chain.machine, chain.machine.name)
     save_net(chain.out / f"{name}.npz", net)
     return net
 
@@ -90,7 +91,7 @@ def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     return train_policy(chain.machine, driven, recipe, seed, chain.out / POLICIES[name])
 
 
-def learn(chain: Chain, log: logs.Log, paper_log: logs.Log) -> dict[str, Any]:
+def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
     """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names."""
     tune = partial(baselines.tuned_baselines, chain.machine)
     jobs: dict[str, Callable[..., Any]] = {

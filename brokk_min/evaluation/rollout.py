@@ -6,16 +6,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brokk_min.actuator import PLANT, Plant
-from brokk_min.env import initial_state, measure, transition
+from brokk_min.env import draw_noise, initial_state, measure, transition
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
-from brokk_min.learning.episodes import draw_noise
 from brokk_min.machine import Array, Machine, Measured
+from brokk_min.settings import TaskConfig
 
 TITLES = {  # of controllers in tables, figures and windows, by their names in files
     "pid_by_hand_raw": "PID by hand, raw",
     "pid_by_hand": "PID by hand",
-    "jacobian_pid_k0.1": "PID optimised, k = 0.1",
-    "jacobian_pid_k0.05": "PID optimised, k = 0.05",
+    "jacobian_pid_k0.1": "PID optimised",
     "rl_critic": "PPO as printed, critic",
     "rl_paper": "PPO, the paper's agent",
     "rl": "PPO, our interface",
@@ -63,11 +62,11 @@ def rollout(
     `noise` the largest of the sensors [deviations]. No episode ends.
     """
     state = initial_state(machine, start, goals[0], plant)
-    controller_state = controller.start(len(state.q))
+    controller_state, config = controller.start(len(state.q)), TaskConfig(noise=noise)
     ticks = []
     for goal in goals:
         v_goal = np.broadcast_to(goal.astype(np.float32), state.v_goal.shape)
-        error = draw_noise(machine, noise, len(state.q), rng)
+        error = draw_noise(machine, config, rng, len(state.q))
         measured = measure(machine, state.history, v_goal, error)
         u, controller_state = controller(measured, controller_state)
         state = transition(machine, plant, state._replace(v_goal=v_goal), u)

@@ -15,9 +15,9 @@ from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, brief, numbers, read_csv
 from brokk_min.actuator import cylinder_speeds, lever_arm
+from brokk_min.env import draw_goal, draw_hold, draw_pose
 from brokk_min.jacobian import dls, limit_weights
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
-from brokk_min.learning.episodes import draw_goal, draw_hold, draw_pose
 from brokk_min.machine import BROKK_170, PWM_MAX, Array, Machine, require, valve_opening
 from brokk_min.settings import TaskConfig
 
@@ -159,7 +159,7 @@ def draw_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed:
     rng = np.random.default_rng(seed)
 
     def draw() -> Array:
-        poses = draw_pose(machine, rng, POSES).round(4)
+        poses = draw_pose(machine, TUNING, rng, POSES).round(4)
         poses = np.clip(poses, machine.column("q_min"), machine.column("q_max"))
         for sequence in sequences:
             poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
@@ -208,7 +208,8 @@ def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> 
     motions = POSES * int(np.ceil(seconds / TUNING.hold_min_s))  # enough for each pose
 
     def draw() -> Iterable[tuple[Array, Array]]:
-        poses, v_goal = draw_pose(machine, rng, POSES), draw_goal(machine, TUNING, rng, motions)
+        poses = draw_pose(machine, TUNING, rng, POSES)
+        v_goal = draw_goal(machine, TUNING, rng, motions)
         rests = np.rint(_log_uniform(rng, motions) * machine.rate).astype(int)
         ticks = np.where(v_goal.any(axis=1), draw_hold(machine, TUNING, rng, motions), rests)
         runs = zip(np.split(v_goal, POSES), np.split(ticks, POSES), strict=True)

@@ -1,1 +1,1 @@
-"""From logs to nets: log files, excitation, fitting, validation."""
+"""From logs to nets: log files, inspection, our fit, validation."""

@@ -19,8 +19,7 @@ from scipy.signal import lfilter
 from tqdm import tqdm
 
 from brokk_min._files import brief
-from brokk_min.identification import logs
-from brokk_min.identification.logs import Log, Recording, Samples
+from brokk_min.fit import COMMANDED, Log, Recording, Samples, driven, join_recordings
 from brokk_min.machine import Array, Machine
 
 # What is searched, all assumed.
@@ -57,15 +56,15 @@ class JointReport(NamedTuple):
 
 def inspect(log: Log) -> dict[str, JointReport]:
     """A report of each joint that is driven in a log."""
-    reports, samples = {}, logs.join_recordings(log)
+    reports, samples = {}, join_recordings(log)
     for j, name in enumerate(tqdm(log.joints, desc="inspect", unit="joint", disable=None)):
-        recordings = [one for one in log.recordings if logs.driven(one)[j]]
+        recordings = [one for one in log.recordings if driven(one)[j]]
         if recordings:
             rows = samples.moves[:, j]
             u, q, q_dot = (x[rows, j] for x in (samples.u, samples.q, samples.q_dot))
             each = [(one.name, motion_of([one], j, log.rate)) for one in recordings]
             model = fit_model(motion_of(recordings, j, log.rate))
-            ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > logs.COMMANDED)
+            ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
             reports[name] = JointReport(
                 minutes=ticks / log.rate / 60,
                 low=q.min(),
@@ -95,7 +94,7 @@ def sign(u: Array, q_dot: Array, rate: float) -> int:
 def followed_joints(log: Log, samples: Samples, j: int) -> dict[str, float]:
     """Joints with which joint `j` moves at their speed while it has no commands, and the slopes."""
     second = np.ones(round(log.rate))
-    recent = np.convolve(np.abs(samples.u[:, j]) > logs.COMMANDED, second)[: len(samples.u)]
+    recent = np.convolve(np.abs(samples.u[:, j]) > COMMANDED, second)[: len(samples.u)]
     q_dot = np.where(recent[:, None] == 0, samples.q_dot, 0.0)
     power = np.square(q_dot).sum(axis=0)
     slopes = q_dot.T @ q_dot[:, j] / np.maximum(power, 1e-12)

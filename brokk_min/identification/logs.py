@@ -7,92 +7,20 @@ are estimated, because a bus carries angles alone. Joints may have any names. Th
 below the machine's, and it may jitter.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import compress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brokk_min._files import brief, expected, whole_file, write_csv
-from brokk_min.actuator import estimate_velocity
+from brokk_min.fit import Log, Recording, Rows, driven, join_recordings, velocity_of
 from brokk_min.identification.columns import TOPICS, Mapped, load_table
-from brokk_min.identification.readings import Rows, check_run, left_out, pieces_of
+from brokk_min.identification.readings import check_run, left_out, pieces_of
 from brokk_min.machine import Array, Machine, require
 
-RATE = 20.0  # Hz, paper: everything runs at 20 Hz; other machines have others
-COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
-MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
 MEAN_OF = 10  # samples of the held command in a tick, of which the mean is taken
-
-
-class Recording(NamedTuple):
-    """One recording of a log: arrays (T, n) of command [-1, 1], angle [rad], velocity [rad/s]."""
-
-    name: str
-    u: Array
-    q: Array
-    q_dot: Array
-
-
-class Log(NamedTuple):
-    """Recordings of the same joints."""
-
-    joints: tuple[str, ...]
-    recordings: tuple[Recording, ...]
-    rate: float = RATE  # Hz
-    warnings: tuple[str, ...] = ()  # of what was left out
-
-
-def machine_log(machine: Machine, recordings: Iterable[tuple[str, Array, Array]]) -> Log:
-    """A log from names, commands and encoder angles (T, n) [rad]; velocities are estimated."""
-    samples, rate = machine.velocity_samples, machine.rate
-    result = [Recording(name, u, q, velocity_of(q, samples, rate)) for name, u, q in recordings]
-    return Log(machine.names, tuple(result), rate=rate)
-
-
-def velocity_of(q: Array, samples: int, rate: float = RATE) -> Array:
-    """`estimate_velocity` [rad/s] of each row of angles [rad] (T, n), at rest before the first."""
-    padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
-    return estimate_velocity(windows, samples, 1 / rate)
-
-
-class Samples(NamedTuple):
-    """The recordings of a log joined, N samples (N, n); a window must not cross their seams."""
-
-    u: Array  # [-1, 1]
-    q: Array  # rad
-    q_dot: Array  # rad/s
-    target: Array  # rad/s, output of the nets; none for the last sample of a recording
-    moves: NDArray[np.bool_]  # the joint is `driven` in this recording
-    lengths: list[int]  # of the recordings
-
-    def starts(self, before: int, after: int, step: int) -> Rows:
-        """Every `step`-th sample with `before` and `after` samples around it in its recording."""
-        seams = np.cumsum([0, *self.lengths])
-        parts = [np.arange(before, length - after, step) for length in self.lengths]
-        return np.concatenate([seam + part for seam, part in zip(seams, parts, strict=False)])
-
-    def windows(self, history: int, ticks: int) -> list[Rows]:
-        """Newest samples of windows of `history` samples, `ticks` before an end, of each joint."""
-        ends = self.starts(history - 1, ticks, 1)
-        return [ends[moves] for moves in self.moves[ends].T]
-
-
-def driven(recording: Recording) -> NDArray[np.bool_]:
-    """Which joints have a command or move in a recording (n,); a parked one may creep a little."""
-    commanded = np.ptp(recording.u, axis=0) > COMMANDED
-    return np.asarray(commanded | (np.ptp(recording.q, axis=0) > MOVED))
-
-
-def join_recordings(log: Log) -> Samples:
-    """Join recordings; the target is the velocity of the coming tick, (q(t+dt) - q(t)) / dt."""
-    lengths = [len(recording.q) for recording in log.recordings]
-    moves = np.repeat([driven(recording) for recording in log.recordings], lengths, axis=0)
-    u, q, q_dot = map(np.concatenate, list(zip(*log.recordings, strict=True))[1:])
-    return Samples(u, q, q_dot, np.diff(q, axis=0, append=0) * log.rate, moves, lengths)
 
 
 def split(log: Log) -> tuple[Log, Log]:

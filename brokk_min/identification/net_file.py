@@ -15,7 +15,7 @@ from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.machine import Array, Machine, require
 
-KIND = "actuator net 5"
+KIND = "actuator net 6"
 CLASSES = {"paper": ActuatorNet, "valve": ValveNet, "ensemble": NetEnsemble}  # by name in files
 NAMES = {kind: name for name, kind in CLASSES.items()}
 

@@ -11,9 +11,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from brokk_min._files import brief
+from brokk_min.fit import Rows
 from brokk_min.machine import Array, require
 
-Rows = NDArray[np.intp]
 MAX_GAP = 0.25  # s, or 2.5 samples, assumed: longer gaps cut a recording
 NOISE = 0.01  # rad or m, assumed: such steps are no motion
 FASTER = 2.0  # times the fastest motion, as in the safety gate: no joint does it

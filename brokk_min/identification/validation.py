@@ -9,12 +9,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from brokk_min.actuator import ActuatorNet, append_command, append_sample
-from brokk_min.identification.logs import Log, Samples, join_recordings
-from brokk_min.machine import Array, require
+from brokk_min.actuator import PLANT, ActuatorNet, Plant, append_command, append_sample
+from brokk_min.fit import Log, Samples, join_recordings, machine_log
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command, read_encoder, require
 
 HORIZONS = (1, 5, 10, 30)  # s, of the free runs
 
@@ -27,6 +27,7 @@ def free_run(
     Each run has the recorded commands and begins at one of the samples `starts` (s,), which have a
     history before them.
     """
+    low, high = samples.q.min(axis=0), samples.q.max(axis=0)  # of the recordings
     q_error, v_error = np.empty((2, ticks, *samples.q[starts].shape))
     parts = max(1, math.ceil(len(starts) / 8192))  # bounds the memory
     for runs in np.array_split(np.arange(len(starts)), parts):
@@ -38,7 +39,6 @@ def free_run(
         for k in range(ticks):
             u = samples.u[at + k]
             velocity = net.predict(append_command(history, u))
-            low, high = np.minimum(q, net.q_low), np.maximum(q, net.q_high)  # of the training
             q = np.clip(q + velocity / net.rate, low, high)
             history = append_sample(history, u, q, net.velocity_samples, 1 / net.rate)
             q_error[k, runs] = q - samples.q[at + k + 1]
@@ -102,3 +102,44 @@ def warnings(scores: Mapping[str, Any]) -> Iterator[str]:
     for name, one in scores.items():
         if one.get("one_step_rmse", 0) > one.get("persistence_rmse", 0):
             yield f"{name}: expected a net that errs less than the last velocity again, got more"
+
+
+def task_log(
+    machine: Machine,
+    recordings: int,
+    seconds: float,
+    rng: np.random.Generator,
+    start: ArrayLike | None = None,
+    plant: Plant = PLANT,
+) -> Log:
+    """Recordings under commands like a policy's: driven joints together, small corrections.
+
+    In every fifth recording the locked joints move instead. Commands are smoothed random levels
+    held for 0.5 to 5 s, less often towards the nearer end of the range. For validation only.
+    `recordings` is their number, `seconds` the length of each [s]. All begin at the angles `start`
+    (n,) [rad]; None: at random ones.
+    """
+    q_min, q_max = machine.column("q_min"), machine.column("q_max")
+    shape, limit = (recordings, machine.n), machine.pwm_limit / PWM_MAX
+    q = rng.uniform(0.8 * q_min + 0.2 * q_max, 0.2 * q_min + 0.8 * q_max, shape)
+    if start is not None:
+        q = np.tile(start, (recordings, 1))
+    level, command, remaining = np.zeros((3, *shape))
+    smoothing = rng.uniform(0.05, 0.6, shape)
+    noise = rng.uniform(0, 0.06, shape)
+    move_locked = (np.arange(recordings) % 5 == 4)[:, None]
+    moving = np.isin(np.arange(machine.n), machine.locked) == move_locked
+    state, u_log, q_log = plant.reset(machine, q), [], []
+    for _ in range(round(seconds * machine.rate)):
+        q_log.append(read_encoder(machine, state.q))
+        fraction = (q_log[-1] - q_min) / (q_max - q_min)
+        up = rng.random(shape) > np.clip(1.5 * fraction - 0.25, 0, 1)
+        drawn = np.where(up, 1, -1) * rng.uniform(0, limit, shape) * (rng.random(shape) < 0.85)
+        level = np.where(remaining <= 0, drawn, level)
+        remaining = np.where(remaining <= 0, rng.uniform(0.5, 5.0, shape), remaining) - machine.dt
+        command = command + smoothing * (level - command)
+        jitter = noise * rng.standard_normal(shape) * (level != 0)
+        u_log.append(limit_command(machine, moving * (command + jitter)))
+        state = plant.step(machine, state, u_log[-1])
+    u, q = np.stack(u_log, axis=1), np.stack(q_log, axis=1)
+    return machine_log(machine, [(f"task_{i:02d}", u[i], q[i]) for i in range(recordings)])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from tqdm import tqdm
 
 from brokk_min import ppo
@@ -15,8 +16,8 @@ from brokk_min._files import expect_same, expected, whole_file, write_csv
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
 from brokk_min.beyond.muon import muon
+from brokk_min.env import map_arrays
 from brokk_min.identification.net_file import fingerprint
-from brokk_min.learning.episodes import map_arrays
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import INTERFACES, Policy, contract, save_policy
 from brokk_min.learning.recipes import Recipe
@@ -25,6 +26,7 @@ from brokk_min.ppo import Agent, Checkpoint, Rollout
 
 EVERY = 50  # updates between two checkpoints
 Rows = list[dict[str, float]]  # of a learning curve
+Env = VectorEnv[Any, Any, Any]  # a `TaskVectorEnv`, or groups in one
 
 
 def train_policy(
@@ -66,14 +68,14 @@ def train_policy(
 
 def prepare(
     machine: Machine, net: ActuatorNet, recipe: Recipe, seed: int
-) -> tuple[TaskVectorEnv, ppo.Advantages, Checkpoint]:
+) -> tuple[Env, ppo.Advantages, Checkpoint]:
     """The environments of a recipe, its advantages, and the beginning of its training."""
     config = recipe.learner
-    simulation = (config.num_envs, net, machine, recipe.task, INTERFACES[recipe.interface])
-    env: TaskVectorEnv = TaskVectorEnv(*simulation)
+    interface = INTERFACES[recipe.interface]
+    env: Env = TaskVectorEnv(config.num_envs, net, machine, recipe.task, interface)
     advantages: ppo.Advantages = ppo.critic_advantages
     if not recipe.critic:
-        env, advantages = GroupVectorEnv(*simulation, horizon=config.horizon), group_advantages
+        env, advantages = GroupVectorEnv(env, config.horizon), group_advantages
     start = ppo.begin(env, config, seed)
     if recipe.muon:
         start = start._replace(optimizer=muon(start.agent, config))
@@ -86,28 +88,30 @@ def actor_weights(agent: Agent) -> tuple[np.ndarray, ...]:
     return tuple(weight.detach().numpy().T.copy() for weight in agent.actor.parameters())
 
 
-def stagger_episodes(env: TaskVectorEnv) -> None:
+def stagger_episodes(env: Env) -> None:
     """Let the first episodes end one after the other: every batch then has some starts."""
-    episode_ticks = round(env.config.episode_s * env.machine.rate)
+    inner: Any = env.unwrapped
+    machine, state = inner.task.machine, inner.episodes.state
+    episode_ticks = round(inner.task.config.episode_s * machine.rate)
     ticks = np.arange(env.num_envs) * episode_ticks // env.num_envs
-    low = env.state.lowest < env.machine.ground  # these end in their first tick, as always
-    env.state = env.state._replace(ticks=np.where(low, 0, ticks))
+    low = state.lowest < machine.ground  # these end in their first tick, as always
+    state = state._replace(ticks=np.where(low, 0, ticks))
+    inner.episodes = inner.episodes._replace(state=state)
 
 
-def save(
-    path: Path, about: dict[str, Any], env: TaskVectorEnv, now: Checkpoint, rows: Rows
-) -> None:
+def save(path: Path, about: dict[str, Any], env: Env, now: Checkpoint, rows: Rows) -> None:
     """Write a checkpoint from which a training continues to the same bits."""
     arrays: list[torch.Tensor] = []
-    map_arrays(lambda array: arrays.append(torch.tensor(array)), (env.state, env.memory))
+    inner: Any = env.unwrapped
+    map_arrays(lambda array: arrays.append(torch.tensor(array)), inner.episodes)
     content = {
         "about": json.dumps(about),
         "agent": now.agent.state_dict(),
         "optimizer": now.optimizer.state_dict(),
         "obs": now.obs,
-        "steps": [now.global_step, now.update],
+        "progress": [now.global_step, now.update, now.learning_rate],
         "torch_random": torch.get_rng_state(),
-        "numpy_random": env.np_random.bit_generator.state,
+        "numpy_random": inner.np_random.bit_generator.state,
         "arrays": arrays,
         "rows": rows,
     }
@@ -117,9 +121,7 @@ def save(
         file.write(buffer.getvalue())
 
 
-def load(
-    path: Path, about: dict[str, Any], env: TaskVectorEnv, fresh: Checkpoint
-) -> tuple[Checkpoint, Rows]:
+def load(path: Path, about: dict[str, Any], env: Env, fresh: Checkpoint) -> tuple[Checkpoint, Rows]:
     """The training of a checkpoint and its curve, in place of a fresh one of the same settings."""
     with expected(path, "a readable checkpoint"):
         content = torch.load(path, weights_only=True)  # executes nothing
@@ -127,9 +129,9 @@ def load(
         fresh.agent.load_state_dict(content["agent"])
         fresh.optimizer.load_state_dict(content["optimizer"])
         arrays = iter(content["arrays"])
-        simulation = env.state, env.memory
-        env.state, env.memory = map_arrays(lambda _: next(arrays).numpy(), simulation)
-        env.np_random.bit_generator.state = content["numpy_random"]
+        inner: Any = env.unwrapped
+        inner.episodes = map_arrays(lambda _: next(arrays).numpy(), inner.episodes)
+        inner.np_random.bit_generator.state = content["numpy_random"]
         torch.set_rng_state(content["torch_random"])
-        now = Checkpoint(fresh.agent, fresh.optimizer, content["obs"], *content["steps"])
+        now = Checkpoint(fresh.agent, fresh.optimizer, content["obs"], *content["progress"])
         return now, content["rows"]

@@ -18,18 +18,15 @@ from numpy.typing import NDArray
 
 from brokk_min import env
 from brokk_min.actuator import PLANT, Plant
-from brokk_min.env import PAPER, Interface, State, measure
-from brokk_min.learning.episodes import draw_noise, map_arrays, new_goals, replace_rows, reset
+from brokk_min.env import PAPER, Bools, Interface
 from brokk_min.machine import BROKK_170, Array, Machine, require
 from brokk_min.settings import TaskConfig
 
-Bools = NDArray[np.bool_]
-Step = tuple[Array, Array, Bools, Bools, dict[str, Any]]  # of a vector: obs, reward, ends, info
 TASK = TaskConfig()
 
 
 class TaskVectorEnv(VectorEnv[Array, Array, Any]):
-    """Many machines that follow random tool velocities. Paper: Fig. 4
+    """`env.reset` and `env.step` as Gymnasium's vector environment. Paper: Fig. 4
 
     `info["velocity_error"]` is |v_goal - v_tool| [m/s], and `info["new_goal"]` says where the goal
     has changed since. Gymnasium explains `AutoresetMode` and `info["final_obs"]`; its vector
@@ -37,10 +34,7 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     seconds of `config`. "rgb_array" renders the first machine. ValueError: a wrong argument.
     """
 
-    copies = 1  # neighbours that share starts, goals, noise and ends: `beyond.group_advantages`
-    state: State
-    memory: Any  # of the agent
-    obs: Array
+    episodes: env.Episodes  # from the first reset on
 
     def __init__(
         self,
@@ -63,8 +57,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self.mode = AutoresetMode(autoreset_mode)
         self.metadata = TaskEnv.metadata | {"autoreset_mode": self.mode}
         self.metadata["render_fps"] = round(machine.rate)
-        self.num_envs, self.plant, self.machine, self.config = num_envs, plant, machine, config
-        self.interface, self.render_mode = interface, render_mode
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.task = env.Task(machine, plant, config, interface)
         mean, _ = interface.scale(machine)
         self.single_observation_space = Box(-np.inf, np.inf, mean.shape, np.float32)
         self.single_action_space = Box(-1.0, 1.0, (len(machine.driven),), np.float32)
@@ -80,63 +74,35 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         mask = (options or {}).get("reset_mask")
         mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
         fits = mask.shape == (self.num_envs,) and mask.dtype == bool
-        fits = fits and bool(mask.any()) and (bool(mask.all()) or hasattr(self, "state"))
+        fits = fits and bool(mask.any()) and (bool(mask.all()) or hasattr(self, "episodes"))
         require(fits, "reset_mask", f"{self.num_envs} booleans", f"{mask.dtype} {mask.shape}")
-        self.begin_episodes(mask)
-        return self.obs, {}
-
-    def begin_episodes(self, mask: Bools) -> None:
-        """Draw new episodes where `mask` is true; others go on."""
-        rows = np.flatnonzero(mask)
-        num = len(rows) // self.copies
-        state = reset(self.machine, self.config, self.np_random, num, self.plant)
-        state = map_arrays(lambda array: array.repeat(self.copies, axis=0), state)
-        fresh = state, *self.observe(state, None)
-        if len(rows) < self.num_envs:
-            fresh = replace_rows((self.state, self.obs, self.memory), rows, fresh)
-        self.state, self.obs, self.memory = fresh
+        if mask.all():
+            self.episodes = env.reset(self.task, self.np_random, self.num_envs)
+        else:
+            self.episodes = env.restart(self.task, self.np_random, self.episodes, mask)
         self.waiting = self.waiting & ~mask
+        return self.episodes.obs, {}
 
-    def observe(self, state: State, memory: Any) -> tuple[Array, Any]:
-        """Observation with fresh noise (5 % in the paper), and the agent's memory with it."""
-        m, num = self.machine, len(state.q) // self.copies
-        noise = draw_noise(m, self.config.noise, num, self.np_random).repeat(self.copies, axis=0)
-        measured = measure(m, state.history, state.v_goal, noise)
-        memory = self.interface.remember(m, memory, measured)
-        return self.interface.observe(m, measured, memory), memory
-
-    def step(self, actions: Array) -> Step:
+    def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
         """One tick of all machines under actions (num_envs, n_driven)."""
-        require(hasattr(self, "state"), "step", "a reset before the first step", "none")
-        m, begin, u_before = self.machine, self.waiting, self.state.history[..., 2, -1]
-        u = self.interface.command(m, np.asarray(actions), self.memory)
-        state, reward, *ends = env.step(m, self.config, self.plant, self.state, u)
-        error = np.linalg.norm(state.v_goal - state.v_tool, axis=-1)
-        info = {"velocity_error": error, "new_goal": state.goal_ticks <= 0}
-        self.state = new_goals(m, self.config, state, self.np_random, self.copies)
-        self.obs, self.memory = self.observe(self.state, self.memory)
-        cost = self.interface.cost(m, u, u_before, self.memory)
-
-        of_groups = np.reshape(ends, (2, -1, self.copies)).any(axis=-1)
-        terminated, truncated = of_groups.repeat(self.copies, axis=-1) & ~begin
-        truncated = truncated & ~terminated
-        reward = np.where(terminated | begin, 0.0, reward - cost)
-        ended = terminated | truncated
-        if begin.any():
-            self.begin_episodes(begin)
-        if self.mode == AutoresetMode.SAME_STEP and ended.any():
-            info |= {"final_obs": self.obs, "_final_obs": ended}
-            self.begin_episodes(ended)
-        self.waiting = ended & (self.mode == AutoresetMode.NEXT_STEP)
-        return self.obs, reward, terminated, truncated, info
+        require(hasattr(self, "episodes"), "step", "a reset before the first step", "none")
+        now = self.task, self.np_random, self.episodes, np.asarray(actions)
+        one_tick = env.step if self.mode == AutoresetMode.SAME_STEP else env.tick
+        self.episodes, reward, terminated, truncated, info = one_tick(*now)
+        if (begin := self.waiting).any():
+            self.episodes = env.restart(self.task, self.np_random, self.episodes, begin)
+            reward = np.where(begin, 0.0, reward)
+            terminated, truncated = terminated & ~begin, truncated & ~begin
+        self.waiting = (terminated | truncated) & (self.mode == AutoresetMode.NEXT_STEP)
+        return self.episodes.obs, reward, terminated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """A picture of the first machine (height, width, 3), with goal and tool velocity."""
         from brokk_min.viewer.drawing import Scene, draw
 
-        s, u = self.state, self.state.history[..., 2, -1]
-        scene = Scene(s.q[0], u[0], s.v_goal[0], s.v_tool[0], title=self.machine.name)
-        return (np.array(draw(self.machine, scene, (640, 360))),)
+        machine, s = self.task.machine, self.episodes.state
+        scene = Scene(s.q[0], s.history[0, :, 2, -1], s.v_goal[0], s.v_tool[0], title=machine.name)
+        return (np.array(draw(machine, scene, (640, 360))),)
 
 
 class TaskEnv(gymnasium.Env[Array, Array]):

@@ -14,7 +14,7 @@ from brokk_min.env import PAPER
 from brokk_min.identification.net_file import net_arrays, net_from_arrays, select_nets
 from brokk_min.machine import Array, Machine, Measured, require
 
-KIND = "policy 8"
+KIND = "policy 9"
 INTERFACES = {"paper": PAPER, "beyond": INTERFACE}  # by their names in files
 POLICIES = {  # files of `reproduce`: our agent, the paper's, and the paper's as printed
     "rl": "policy.npz",

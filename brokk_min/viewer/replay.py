@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from brokk_min._files import whole_file
 from brokk_min.can.drive_log import read_frames, read_telemetry
-from brokk_min.identification.logs import velocity_of
+from brokk_min.fit import velocity_of
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
 from brokk_min.machine import Machine, require
 from brokk_min.viewer.drawing import Scene, draw

@@ -11,6 +11,7 @@ from brokk_min import ppo
 from brokk_min.beyond.group_advantages import COPIES, GroupVectorEnv, group_advantages
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.env import PAPER
+from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.settings import PPOConfig, TaskConfig
 
 TASK = TaskConfig(episode_s=1.5, hold_min_s=0.1, hold_max_s=0.4)  # 30 ticks
@@ -18,7 +19,9 @@ WINDOW = 7
 
 
 def make(interface=PAPER, machine=LOW, num=12):
-    env = GroupVectorEnv(num, obedient_net(machine), machine, TASK, interface, horizon=WINDOW)
+    env = GroupVectorEnv(
+        TaskVectorEnv(num, obedient_net(machine), machine, TASK, interface), WINDOW
+    )
     env.reset(seed=3)
     return env
 
@@ -40,18 +43,26 @@ def test_copies__share_all_but_what_their_own_actions_change(interface):
     ended = 0
     for tick in range(70):
         if tick % WINDOW == 0:
-            assert same(obs) and same(env.state.q) and same(env.state.plant.history)
+            assert (
+                same(obs)
+                and same(env.inner.episodes.state.q)
+                and same(env.inner.episodes.state.plant.history)
+            )
             alike = tick % 2 == 0  # windows in which the actions of a group are the same, or not
         actions = rng.uniform(-1, 1, (12, 4)).astype(np.float32)
         obs, reward, terminated, truncated, _ = env.step(
             groups(actions)[:, :1].repeat(COPIES, 1).reshape(12, 4) if alike else actions
         )
-        assert same(env.state.v_goal) and same(env.state.goal_ticks) and same(env.state.ticks)
+        assert (
+            same(env.inner.episodes.state.v_goal)
+            and same(env.inner.episodes.state.goal_ticks)
+            and same(env.inner.episodes.state.ticks)
+        )
         assert same(reward) and same(obs) if alike else not same(reward)
         last = tick % WINDOW == WINDOW - 1
         assert (terminated | truncated).all() if last else same(truncated)
         ended += not last and truncated.any()
-        goals = groups(env.state.v_goal)[:, 0]
+        goals = groups(env.inner.episodes.state.v_goal)[:, 0]
         assert len(np.unique(goals, axis=0)) == len(goals)  # of groups, they differ
     assert ended
 
@@ -64,7 +75,10 @@ def test_window__ends_in_the_state_of_one_of_the_group_and_keeps_own_last_observ
         obs, _, terminated, truncated, info = env.step(actions)
     assert truncated.all() and not terminated.any() and info["_final_obs"].all()
     assert np.array_equal(info["final_obs"], own)
-    chosen = [np.flatnonzero((twin.state.q == q).all(axis=1)) for q in groups(env.state.q)[:, 0]]
+    chosen = [
+        np.flatnonzero((twin.inner.episodes.state.q == q).all(axis=1))
+        for q in groups(env.inner.episodes.state.q)[:, 0]
+    ]
     assert [row[0] // COPIES for row in chosen] == [0, 1, 2]
     assert np.array_equal(obs, np.repeat(own[[row[0] for row in chosen]], COPIES, axis=0))
 
@@ -73,9 +87,9 @@ def test_starts_in_the_ground__end_the_whole_group_without_reward():
     """The ground is so high that in the first tick some of a group's copies enter it."""
     actions, free = np.random.default_rng(1).uniform(-1, 1, (2000, 4)), make(num=2000)
     free.step(actions)
-    machine = replace(LOW, name="high", ground=float(np.median(free.state.lowest)))
+    machine = replace(LOW, name="high", ground=float(np.median(free.inner.episodes.state.lowest)))
     _, reward, terminated, truncated, _ = make(machine=machine, num=2000).step(actions)
-    below = groups(free.state.lowest < machine.ground)
+    below = groups(free.inner.episodes.state.lowest < machine.ground)
     some = below.any(axis=1)
     assert (some & ~below.all(axis=1)).any()
     assert np.array_equal(groups(terminated), some[:, None].repeat(COPIES, axis=1))

@@ -16,7 +16,7 @@ from strategies import machines, posed
 
 from brokk_min import env
 from brokk_min.beyond import interface
-from brokk_min.beyond.interface import Memory, command, observation_scale, smooth_angles
+from brokk_min.beyond.interface import INTERFACE, Memory, observation_scale, smooth_angles
 from brokk_min.kinematics import forward_kinematics, jacobian
 from brokk_min.machine import BROKK_170
 
@@ -52,10 +52,10 @@ def test_remember__has_the_velocity_that_the_tool_had_when_the_joints_had_theirs
     past = now.q - machine.dt * (machine.velocity_samples - 1) / 2 * q_dot
     tools = [forward_kinematics(machine, past + s * 1e-6 * q_dot).p[:, -1] for s in (1, -1)]
     expected = (tools[0] - tools[1]) / 2e-6 + noise[:3]
-    first = interface.remember(machine, None, now)
+    first = INTERFACE.remember(machine, None, now)
     np.testing.assert_allclose(first.v_tool, expected, atol=1e-6)
     first = first._replace(v_goal=expected + 1e-3)  # a small error, which no cut hides
-    found, same = interface.remember(machine, first, now), now._replace(v_tool=expected)
+    found, same = INTERFACE.remember(machine, first, now), now._replace(v_tool=expected)
     np.testing.assert_allclose(found.v_tool, expected, atol=1e-6)
     integral = interface.accumulate(machine, first, same).error_integral
     np.testing.assert_allclose(found.error_integral, integral, atol=1e-6 / machine.rate)
@@ -66,7 +66,7 @@ def test_observe__by_hand():
     integral = (0.02, -0.01, 0.03)
     v_goal = np.array([0.3, -0.1, -0.15], np.float32)
     measured = env.measure(BROKK_170, numbered_history(), v_goal)
-    obs = interface.observe(BROKK_170, measured, memory(0, integral))
+    obs = INTERFACE.observe(BROKK_170, measured, memory(0, integral))
     assert obs.shape == (91,) and obs.dtype == np.float32
     mean, std, _ = env.observation_table(BROKK_170)
     paper = env.features(BROKK_170, measured)
@@ -125,7 +125,7 @@ def test_scale__of_any_machine_lets_the_samples_of_a_signal_weigh_as_one_number(
 
 @given(machines(), st.floats(-0.02, 0.02) | st.floats(-2, 2))
 def test_command__is_piecewise_linear_beyond_each_valves_own_dead_zone(machine, a):
-    u = command(machine, np.full(len(machine.driven), a), memory()) * 127
+    u = INTERFACE.command(machine, np.full(len(machine.driven), a), memory()) * 127
     for j, joint in enumerate(machine.joints):
         dead = 127 * joint.dead_zone[0 if a > 0 else 1]
         knee = dead + 0.01 * (machine.pwm_limit - dead)
@@ -136,17 +136,19 @@ def test_command__is_piecewise_linear_beyond_each_valves_own_dead_zone(machine, 
 
 def test_command__opens_a_valve_wider_shortly_before_it_answers():
     """1.25 times from 0.25 to 0.4 s after it was closed, each valve by itself; at most fully."""
-    u = command(BROKK_170, np.full(4, 0.5), memory(open_ticks=[4, 5, 7, 8]))
-    plain, wide = (command(BROKK_170, np.full(4, a), memory())[DRIVEN] for a in (0.5, 0.625))
+    u = INTERFACE.command(BROKK_170, np.full(4, 0.5), memory(open_ticks=[4, 5, 7, 8]))
+    plain, wide = (
+        INTERFACE.command(BROKK_170, np.full(4, a), memory())[DRIVEN] for a in (0.5, 0.625)
+    )
     assert u[DRIVEN].tolist() == [plain[0], wide[1], wide[2], plain[3]]
-    assert np.abs(command(BROKK_170, np.ones(4), memory(open_ticks=5))).max() * 127 == 80
+    assert np.abs(INTERFACE.command(BROKK_170, np.ones(4), memory(open_ticks=5))).max() * 127 == 80
 
 
 def test_command__closes_the_valves_after_a_tenth_of_a_second_without_a_goal():
     """Of a batch of machines each by its own rest; 0.1 s are two ticks."""
-    u = command(BROKK_170, np.full((4, 4), 0.5), memory([0, 2, 3, 1000]))
+    u = INTERFACE.command(BROKK_170, np.full((4, 4), 0.5), memory([0, 2, 3, 1000]))
     assert u[:, DRIVEN].all(axis=1).tolist() == [True, True, False, False]
     assert u.any(axis=1).tolist() == [True, True, False, False]
     slow = replace(BROKK_170, name="slow", rate=10.0)  # one tick
-    assert command(slow, np.full(4, 0.5), memory(1)).any()
-    assert not command(slow, np.full(4, 0.5), memory(2)).any()
+    assert INTERFACE.command(slow, np.full(4, 0.5), memory(1)).any()
+    assert not INTERFACE.command(slow, np.full(4, 0.5), memory(2)).any()

@@ -9,7 +9,8 @@ from helpers_bus import ConstantCommand, HoldingOperator, World
 from helpers_cli import run
 
 from brokk_min.beyond.valve_nets import ValveNet
-from brokk_min.identification.logs import Log, Recording, read_log, write_log
+from brokk_min.fit import Log, Recording
+from brokk_min.identification.logs import read_log, write_log
 from brokk_min.identification.net_file import load_net
 from brokk_min.machine import BROKK_170
 

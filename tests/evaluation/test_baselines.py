@@ -15,13 +15,13 @@ from brokk_min.machine import BROKK_170
 
 NET = obedient_net(BROKK_170)
 HAND = pids(BROKK_170, NET)
-NAMES = [baselines.RAW, baselines.BY_HAND, *baselines.PAPER_BASELINES, baselines.STRONGEST]
+NAMES = [baselines.RAW, baselines.BY_HAND, baselines.OPTIMISED, baselines.STRONGEST]
 
 
 def test_baselines__have_the_papers_structure_but_for_the_strongest():
     assert list(HAND) == NAMES
-    assert [c.k for c in HAND.values()] == [0.1, 0.1, 0.1, 0.05, 0.1]
-    assert [type(c) for c in HAND.values()] == [*[JacobianController] * 4, StrongPID]
+    assert [c.k for c in HAND.values()] == [0.1] * 4
+    assert [type(c) for c in HAND.values()] == [*[JacobianController] * 3, StrongPID]
     opening = np.array([[0.1, -0.2, 0.0, 0.5]])
     raw, compensated = (127 * HAND[name].command(opening)[:, [0, 2, 3, 4]] for name in NAMES[:2])
     np.testing.assert_allclose(raw, [[13, -25, 0, 64]])

@@ -47,7 +47,7 @@ def test_render__begins_with_one_sentence_a_figure_and_a_table():
     page = render()
     numbers, rows, rest = first_screen(page)
     assert numbers == ["0.0303", "0.0404", "0.0202", "0.0101", "0.0105"]
-    names = ["PID by hand", "PID optimised, k = 0.1", "PPO, the paper&#39;s agent"]
+    names = ["PID by hand", "PID optimised", "PPO, the paper&#39;s agent"]
     assert [row[0] for row in rows] == [*names, "PPO, our interface", "strongest PID"]
     assert rows[3][1:3] == ["closed", "0.0101 (0.0091 to 0.0111)"]
     assert page.index("<img") < page.index("<table") and "trial" not in rest

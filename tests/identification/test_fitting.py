@@ -8,10 +8,18 @@ import torch
 from helpers_machines import line
 
 from brokk_min.actuator import ActuatorNet
+from brokk_min.beyond.free_runs import accumulated_loss
 from brokk_min.beyond.valve_nets import ValveNet, mu_law, open_indicator
-from brokk_min.identification import fitting
-from brokk_min.identification.fitting import PAPER_RECIPE, FitConfig, TrainingSet, fit
-from brokk_min.identification.logs import Log, Recording, join_recordings, velocity_of
+from brokk_min.fit import (
+    Log,
+    Recording,
+    TrainingSet,
+    as_they_are,
+    join_recordings,
+    mean_squared_error,
+    velocity_of,
+)
+from brokk_min.identification.fitting import PAPER_RECIPE, OurFitConfig, fit_nets, valve_reader
 from brokk_min.identification.validation import free_run, score
 from brokk_min.machine import BROKK_170
 
@@ -35,7 +43,7 @@ def simple_system(seed, recordings, ticks=300):
 
 def test_fit__learns_a_simple_system():
     log = simple_system(0, 25)
-    net = fit(log, FitConfig(steps=500, batch_size=256), 0, BROKK_170)
+    net = fit_nets(log, OurFitConfig(steps=500, batch_size=256), 0, BROKK_170)
     assert not isinstance(net, ValveNet)  # no machine, no dead zones
     result = score(net, simple_system(1, 6))
     for name in net.joints:
@@ -50,7 +58,7 @@ def test_fit__states_how_the_nets_were_fitted():
     log = simple_system(0, 2, 40)._replace(joints=("q4", "q1"))
     zones = [replace(joint, dead_zone=(0.25, 0.1)) for joint in BROKK_170.joints]
     machine = replace(BROKK_170, name="toy", joints=tuple(zones), history=5, velocity_samples=3)
-    net = fit(log, FitConfig(steps=0), 7, machine, "toy")
+    net = fit_nets(log, OurFitConfig(steps=0), 7, machine, "toy")
     assert (net.joints, net.history, net.rate) == (("q4", "q1"), 5, 20.0)
     assert (net.velocity_samples, net.machine) == (3, "toy")
     assert net.training["seed"] == 7 and net.training["settings"]["steps"] == 0
@@ -62,36 +70,36 @@ def test_fit__states_how_the_nets_were_fitted():
     np.testing.assert_allclose(net.input_scale[:, 14], mu_law(x).std(axis=0), rtol=1e-5)
     opens = open_indicator(x).mean(axis=0)
     np.testing.assert_allclose(net.input_mean[:, 15], opens, rtol=1e-5)
-    paper = fit(log, FitConfig(steps=0, **PAPER_RECIPE), 7, BROKK_170, "brokk170")
+    paper = fit_nets(log, OurFitConfig(steps=0, **PAPER_RECIPE), 7, BROKK_170, "brokk170")
     np.testing.assert_allclose(paper.input_mean[:, 30], u[8:].mean(axis=0), atol=0.1)
 
 
 def test_fit__gives_each_member_of_an_ensemble_a_seed_of_its_own():
     """Three nets by seed 2 are those of seeds 6, 7 and 8 alone."""
     log = simple_system(0, 2, 60)._replace(joints=("q4", "q1"))
-    config = FitConfig(steps=3, batch_size=64, members=3)
-    ensemble = fit(log, config, 2, BROKK_170, "brokk170")
+    config = OurFitConfig(steps=3, batch_size=64, members=3)
+    ensemble = fit_nets(log, config, 2, BROKK_170, "brokk170")
     for k, seed in enumerate((6, 7, 8)):
-        alone = fit(log, replace(config, members=1), seed, BROKK_170, "brokk170")
+        alone = fit_nets(log, replace(config, members=1), seed, BROKK_170, "brokk170")
         assert type(alone) is ValveNet
         for one, every in zip(alone.weights, ensemble.weights, strict=True):
             np.testing.assert_array_equal(one, every[:, k])
-    printed = fit(log, replace(config, valve=False), 0, BROKK_170, "brokk170")
+    printed = fit_nets(log, replace(config, valve=False), 0, BROKK_170, "brokk170")
     assert type(printed) is ActuatorNet and printed.training["settings"]["members"] == 1
 
 
 def test_fit__uses_one_step_errors_where_recordings_are_too_short_for_more():
     log = Log(("a",), tuple(line(f"r{i}", 0.0, 0.1 * i, 15) for i in range(4)))
-    config = FitConfig(steps=5, batch_size=8, rollout=8)
-    one_step = fit(log, replace(config, rollout=1), 0, BROKK_170)
-    same = fit(log, config, 0, BROKK_170)
+    config = OurFitConfig(steps=5, batch_size=8, rollout=8)
+    one_step = fit_nets(log, replace(config, rollout=1), 0, BROKK_170)
+    same = fit_nets(log, config, 0, BROKK_170)
     assert all(map(np.array_equal, one_step.weights, same.weights))
 
 
 def test_fit__has_nets_that_read_the_newest_outputs_and_all_commands():
     """No older angle or velocity changes what they predict after the fit."""
-    config = FitConfig(10, batch_size=16, newest_only=True, valve=False)
-    net = fit(simple_system(0, 3, 60), config, 0, BROKK_170)
+    config = OurFitConfig(10, batch_size=16, newest_only=True, valve=False)
+    net = fit_nets(simple_system(0, 3, 60), config, 0, BROKK_170)
     history = np.random.default_rng(0).uniform(-1, 1, (200, 2, 3, 13)).astype(np.float32)
     before = net.predict(history)
     for row, sample in np.ndindex(3, 13):
@@ -104,32 +112,31 @@ def test_fit__has_nets_that_read_the_newest_outputs_and_all_commands():
 def test_fit__refuses_what_cannot_be_learned():
     short = Log(("a",), tuple(line(f"r{i}", 0.0, 0.1 * i, 13) for i in range(20)))
     with pytest.raises(ValueError, match=r"joint a: expected a recording of 14 samples.*got none"):
-        fit(short, FitConfig(steps=1), 0, BROKK_170)
+        fit_nets(short, OurFitConfig(steps=1), 0, BROKK_170)
     _, *moving = simple_system(0, 1, 40).recordings[0]
     still = Recording("x", *(values * [1, 0] for values in moving))
     with pytest.raises(ValueError, match="joint stick"):
-        fit(Log(("boom", "stick"), (still,)), FitConfig(steps=1), 0, BROKK_170)
+        fit_nets(Log(("boom", "stick"), (still,)), OurFitConfig(steps=1), 0, BROKK_170)
 
 
 def test_fit__has_windows_and_ranges_without_the_jump_between_recordings():
     log = Log(("a",), (line("x", 0, 0.1, 30), line("y", 5, 0.2, 40)))
-    data = TrainingSet(log, FitConfig(rollout=8, valve=False), BROKK_170, np.zeros((1, 2)))
+    data = TrainingSet(log, BROKK_170)
     np.testing.assert_array_equal(data.windows[0], [*range(12, 29), *range(42, 69)])
-    np.testing.assert_array_equal(data.long_windows[0], [*range(12, 22), *range(42, 62)])
-    net = fit(log, FitConfig(steps=0), 0, BROKK_170)
-    ranges = (net.output_low, net.output_high, net.q_low, net.q_high)
-    np.testing.assert_allclose(ranges, [[0.095], [0.205], [0.0], [5.39]], atol=1e-5)
+    np.testing.assert_array_equal(data.joined.windows(13, 8)[0], [*range(12, 22), *range(42, 62)])
+    ranges = (data.output_low, data.output_high, data.q_low, data.q_high)
+    np.testing.assert_allclose(np.stack(ranges), [[0.095], [0.205], [0.0], [5.39]], atol=1e-5)
 
 
 @pytest.mark.parametrize("valve", [False, True])
 def test_accumulated_loss__is_the_error_of_a_free_run(valve):
     """Three ticks on the nets' own outputs, stops included; the first is the one-step loss."""
     log = simple_system(0, 4)._replace(joints=("q1", "q3"))
-    config = FitConfig(steps=1, batch_size=4, rollout=3, valve=valve, members=1)
-    net = fit(log, config, 0, BROKK_170, "brokk170")
+    config = OurFitConfig(steps=1, batch_size=4, rollout=3, valve=valve, members=1)
+    net = fit_nets(log, config, 0, BROKK_170, "brokk170")
     net.weights[5][:] = 1.0  # upwards, by what the nets read
-    zones = np.full((2, 2), 0.07, np.float32)
-    data, samples = TrainingSet(log, config, BROKK_170, zones), join_recordings(log)
+    inputs = valve_reader(np.full((2, 2), 0.07, np.float32)) if valve else as_they_are
+    data, samples = TrainingSet(log, BROKK_170, inputs), join_recordings(log)
     span = (data.output_high - data.output_low).numpy()
     tops = samples.q.argmax(axis=0)
     at = np.array([[20, 40], [350, 700], tops])  # of each window and joint
@@ -137,13 +144,15 @@ def test_accumulated_loss__is_the_error_of_a_free_run(valve):
     for j, starts in enumerate(at.T):
         q_error = free_run(net, samples, starts, 3)[0][..., j]
         q = samples.q[starts + np.arange(1, 4)[:, None], j] + q_error
-        at_stop += np.sum(np.abs(q - net.q_high[j]) < 1e-6)
+        at_stop += np.sum(np.abs(q - samples.q[:, j].max()) < 1e-6)
         expected += np.mean((q_error * 20 / span[j]) ** 2, axis=1)
     assert at_stop >= 2
     weights = [torch.tensor(weight) for weight in net.weights]
     for ticks in (1, 3):
-        loss = fitting.accumulated_loss(data, weights, torch.tensor(at), ticks)
+        loss = accumulated_loss(data, weights, torch.tensor(at), ticks)
         assert float(loss) == pytest.approx(expected[:ticks].mean(), rel=1e-3)
+    one_step = mean_squared_error(data, weights, torch.tensor(at))
+    assert float(one_step) == pytest.approx(expected[0], rel=1e-3)
 
 
 def test_fit__has_a_learning_rate_that_falls_to_zero_in_each_stage(monkeypatch):
@@ -154,5 +163,5 @@ def test_fit__has_a_learning_rate_that_falls_to_zero_in_each_stage(monkeypatch):
         step(optimizer)
 
     monkeypatch.setattr(torch.optim.AdamW, "step", noted)
-    fit(simple_system(0, 2, 60), FitConfig(12, 8, learning_rate=1.0), 0, BROKK_170)
+    fit_nets(simple_system(0, 2, 60), OurFitConfig(12, 8, learning_rate=1.0), 0, BROKK_170)
     assert [rates[step] for step in (0, 4, 8, 10)] == pytest.approx([1.0, 0.5, 0.25, 0.125])

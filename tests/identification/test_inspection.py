@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from brokk_min.identification.excitation import collect, task_log
+from brokk_min.actuator import PLANT
+from brokk_min.beyond.rich_excitation import RICH
+from brokk_min.fit import SINE, Log, Recording, collect, velocity_of
 from brokk_min.identification.inspection import JointReport, inspect, warnings, wrong_signs
-from brokk_min.identification.logs import Log, Recording, velocity_of
+from brokk_min.identification.validation import task_log
 from brokk_min.machine import BROKK_170
 
 TRUE = {  # dead zones, gains [rad/s per full opening], delay [ticks of 0.05 s], tau [s]
@@ -97,12 +99,12 @@ def test_inspect__names_recordings_in_which_angles_fall_under_positive_commands(
     assert "in all recordings or in none, got some in ['1', '4']" in told
 
 
-@pytest.mark.parametrize("excitation", ["sine", "rich"])
+@pytest.mark.parametrize("excitation", [SINE, RICH])
 def test_inspect__finds_no_wrong_sign_in_sound_logs(excitation):
     """Not even in short recordings, or where a joint creeps under commands that open no valve."""
     for seed in range(2):
         rng = np.random.default_rng(seed)
-        assert not [*wrong_signs(inspect(collect(BROKK_170, 0.02, excitation, rng)))]
+        assert not [*wrong_signs(inspect(collect(BROKK_170, 0.02, rng, PLANT, excitation)))]
     log = task_log(BROKK_170, 5, 8.0, np.random.default_rng(0))
     assert not [*wrong_signs(inspect(log))]
     ticks = np.arange(600)

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from brokk_min.fit import Log, Recording, velocity_of
 from brokk_min.identification import logs
-from brokk_min.identification.logs import Log, Recording, read_log, velocity_of
+from brokk_min.identification.logs import read_log
 from brokk_min.machine import BROKK_170
 
 

@@ -31,7 +31,7 @@ def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "policy 5"}, "expected .*actuator net 5 .*fit again.*, got 'policy 5'"),
+        ({"kind": "policy 5"}, "expected .*actuator net 6 .*fit again.*, got 'policy 5'"),
         ({"reads": "valve"}, "expected a complete actuator net, got .*dead_zones"),
         ({"joints": ["a", "b"]}, "expected a complete actuator net, got "),
     ],
@@ -39,7 +39,7 @@ def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
 def test_load_net__names_file_and_fault(tmp_path, change, message):
     path = tmp_path / "net.npz"
     header, arrays = net_file.net_arrays(random_net())
-    save_arrays(path, "actuator net 5", header | change, **arrays)
+    save_arrays(path, "actuator net 6", header | change, **arrays)
     with pytest.raises(ValueError, match=rf"^{path}: {message}"):
         load_net(path)
 
@@ -66,7 +66,7 @@ def test_select_nets__predict_as_they_do_among_others(net):
         assert alone.joints == tuple(joints)
         expected = net.predict(history)[:, index]
         np.testing.assert_allclose(alone.predict(history[:, index]), expected, atol=1e-6)
-        np.testing.assert_array_equal(alone.q_low, net.q_low[index])
+        np.testing.assert_array_equal(alone.output_low, net.output_low[index])
 
 
 def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers_machines import constant_net, line
 
-from brokk_min.identification.logs import Log, Recording
+from brokk_min.fit import Log, Recording
 from brokk_min.identification.validation import score, warnings
 
 
@@ -53,8 +53,8 @@ def test_score__refuses_a_log_of_another_rate_or_without_a_whole_history():
 
 
 def test_warnings__name_nets_no_better_than_the_last_velocity():
-    """The velocity alternates between -0.1 and 0.1 rad/s: the last one again is off by 0.2."""
-    q_dot = 0.1 * (-1.0) ** np.arange(40)[:, None]
+    """The velocity alternates between 0 and 0.2 rad/s: the last one again is off by 0.2."""
+    q_dot = 0.1 + 0.1 * (-1.0) ** np.arange(40)[:, None]
     test = Log(("a",), (Recording("x", q_dot, np.cumsum(q_dot, axis=0) / 20, q_dot),))
-    told = [[*warnings(score(constant_net([v], ("a",)), test))] for v in (0.0, 0.4)]
+    told = [[*warnings(score(constant_net([v], ("a",)), test))] for v in (0.1, 0.5)]
     assert told == [[], ["a: expected a net that errs less than the last velocity again, got more"]]

@@ -59,13 +59,14 @@ def test_prepare__begins_what_the_recipe_says(paper, critic):
     """Our agent by groups steps by Muon, all others by Adam; episodes end one after the other."""
     recipe = find_recipe(paper, critic)
     env, advantages, start = prepare(BROKK_170, NET, recipe, seed=3)
-    assert env.interface is (PAPER if paper else INTERFACE)
+    task, state = env.unwrapped.task, env.unwrapped.episodes.state
+    assert task.interface is (PAPER if paper else INTERFACE)
     assert isinstance(env, GroupVectorEnv) != critic
     assert advantages is (critic_advantages if critic else group_advantages)
     assert isinstance(start.optimizer, torch.optim.Muon) != (paper or critic)
-    assert len(np.unique(env.state.ticks)) > 100 and env.state.ticks.max() > 0.95 * 400
-    assert not env.state.ticks[env.state.lowest < 0].any()
-    assert start.obs.shape == (256, len(env.interface.scale(BROKK_170)[0]))
+    assert len(np.unique(state.ticks)) > 100 and state.ticks.max() > 0.95 * 400
+    assert not state.ticks[state.lowest < 0].any()
+    assert start.obs.shape == (256, len(task.interface.scale(BROKK_170)[0]))
 
 
 @pytest.mark.parametrize("kind", ["ours", "paper"])

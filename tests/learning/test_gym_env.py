@@ -19,6 +19,12 @@ NET = small_net(LOW, np.random.default_rng(0))
 ID = "brokk_min.learning.gym_env:brokk_min/Brokk170-v0"
 
 
+def set_ticks(env, ticks):
+    """Ticks since the resets of its machines."""
+    state = env.episodes.state._replace(ticks=ticks)
+    env.episodes = env.episodes._replace(state=state)
+
+
 @pytest.mark.parametrize("interface", [PAPER, INTERFACE], ids=["paper", "beyond"])
 @pytest.mark.parametrize("plant", [PLANT, obedient_net(LOW)], ids=["plant", "nets"])
 def test_step__resets_only_the_rows_that_ended_and_gives_their_last_observation(plant, interface):
@@ -27,7 +33,7 @@ def test_step__resets_only_the_rows_that_ended_and_gives_their_last_observation(
     long = TaskVectorEnv(4, plant, LOW, TaskConfig(episode_s=9.0), interface)
     obs, _ = short.reset(seed=5)
     twin_obs, _ = long.reset(seed=5)
-    short.state = short.state._replace(ticks=np.array([3, 0, 3, 0]))
+    set_ticks(short, np.array([3, 0, 3, 0]))
     rng = np.random.default_rng(18)
     for tick in range(1, 18):
         assert np.array_equal(obs, twin_obs)
@@ -43,10 +49,10 @@ def test_step__resets_only_the_rows_that_ended_and_gives_their_last_observation(
     assert np.array_equal(info["final_obs"], twin_obs)
     assert np.array_equal(obs[[1, 3]], twin_obs[[1, 3]])
     assert np.abs(obs - twin_obs)[[0, 2]].max(axis=1).min() > 1e-3
-    assert short.state.ticks.tolist() == [0, 17] * 2
+    assert short.episodes.state.ticks.tolist() == [0, 17] * 2
     if interface is INTERFACE:  # a new episode forgets the error of the old one
-        assert not short.memory.error_integral[[0, 2]].any()
-        assert short.memory.error_integral[[1, 3]].any(axis=1).all()
+        assert not short.episodes.memory.error_integral[[0, 2]].any()
+        assert short.episodes.memory.error_integral[[1, 3]].any(axis=1).all()
 
 
 def test_step__leaks_nothing_between_rows():
@@ -64,7 +70,7 @@ def test_step__leaks_nothing_between_rows():
         obs_right, rewards_right, *_ = right.step(changed)
         assert np.array_equal(obs[others], obs_right[others])
         assert np.array_equal(rewards[others], rewards_right[others])
-    assert not np.array_equal(left.state.q[2], right.state.q[2])
+    assert not np.array_equal(left.episodes.state.q[2], right.episodes.state.q[2])
 
 
 def test_step__subtracts_the_costs_of_the_interface_from_eq2():
@@ -72,12 +78,12 @@ def test_step__subtracts_the_costs_of_the_interface_from_eq2():
     env.reset(seed=1)
     rng = np.random.default_rng(2)
     for _ in range(3):
-        v_goal, before = env.state.v_goal, env.state.history[..., 2, -1]
+        v_goal, before = env.episodes.state.v_goal, env.episodes.state.history[..., 2, -1]
         _, rewards, *_, info = env.step(rng.uniform(-1, 1, (5, 4)))
-        u = env.state.history[..., 2, -1]
-        error = np.linalg.norm(v_goal - env.state.v_tool, axis=-1)
+        u = env.episodes.state.history[..., 2, -1]
+        error = np.linalg.norm(v_goal - env.episodes.state.v_tool, axis=-1)
         np.testing.assert_allclose(info["velocity_error"], error, rtol=1e-6)
-        expected = 1 / (1 + error) - INTERFACE.cost(LOW, u, before, env.memory)
+        expected = 1 / (1 + error) - INTERFACE.cost(LOW, u, before, env.episodes.memory)
         np.testing.assert_allclose(rewards, expected, atol=1e-6)
 
 
@@ -85,7 +91,7 @@ def test_next_step__ended_episodes_begin_in_the_step_after_theirs():
     """That step has no reward and no action; Gymnasium's wrappers of observations need it."""
     env = TaskVectorEnv(3, NET, LOW, SIX_TICKS, autoreset_mode=AutoresetMode.NEXT_STEP)
     env.reset(seed=0)
-    env.state = env.state._replace(ticks=np.array([4, 0, 0]))
+    set_ticks(env, np.array([4, 0, 0]))
     seen = [env.step(np.ones((3, 4))) for _ in range(4)]
     assert [ends.tolist() for *_, ends, _ in seen] == [[i == 1, False, False] for i in range(4)]
     assert [rewards[0] > 0 for _, rewards, *_ in seen] == [True, True, False, True]
@@ -97,7 +103,11 @@ def test_next_step__ended_episodes_begin_in_the_step_after_theirs():
     assert env.step(np.ones((3, 4)))[3].tolist() == [False, True, True]
     env.reset(options={"reset_mask": np.array([False, True, False])})
     env.step(np.ones((3, 4)))
-    assert env.state.ticks.tolist() == [4, 1, 0]  # what the caller reset does not begin again
+    assert env.episodes.state.ticks.tolist() == [
+        4,
+        1,
+        0,
+    ]  # what the caller reset does not begin again
 
 
 def test_reset_mask__begins_its_rows_anew_and_lets_the_others_go_on():
@@ -106,13 +116,13 @@ def test_reset_mask__begins_its_rows_anew_and_lets_the_others_go_on():
     env.reset(seed=0)
     for _ in range(7):
         before, _, _, truncated, _ = env.step(np.full((4, 4), 0.5))
-    assert truncated.all() and (env.state.ticks == 7).all()
+    assert truncated.all() and (env.episodes.state.ticks == 7).all()
     mask = np.array([True, False, False, True])
     after, _ = env.reset(options={"reset_mask": mask})
     assert np.array_equal(after[~mask], before[~mask])
     assert (after[mask] != before[mask]).any(axis=1).all()
-    assert env.state.ticks.tolist() == [0, 7, 7, 0]
-    assert env.memory.error_integral.any(axis=1).tolist() == [False, True, True, False]
+    assert env.episodes.state.ticks.tolist() == [0, 7, 7, 0]
+    assert env.episodes.memory.error_integral.any(axis=1).tolist() == [False, True, True, False]
     assert env.step(np.zeros((4, 4)))[3].tolist() == [False, True, True, False]
     for bad in ([True], [1, 0, 0, 1]):
         with pytest.raises(ValueError, match="reset_mask: expected 4 booleans, got"):
@@ -124,9 +134,9 @@ def test_step__says_where_the_goal_is_a_new_one():
     env.reset(seed=0)
     changes = []
     for _ in range(10):
-        before = env.state.v_goal
+        before = env.episodes.state.v_goal
         info = env.step(np.zeros((50, 4)))[4]
-        assert np.array_equal(info["new_goal"], (env.state.v_goal != before).any(axis=1))
+        assert np.array_equal(info["new_goal"], (env.episodes.state.v_goal != before).any(axis=1))
         changes.append(info["new_goal"].mean())
     assert 0.1 < np.mean(changes) < 0.4
 
@@ -180,7 +190,7 @@ def test_make_vec__gives_the_vector_class():
         TaskVectorEnv(2).reset(options={"reset_mask": np.array([True, False])})  # the first reset
     env = gymnasium.make_vec(ID, num_envs=256, max_episode_steps=6)
     assert isinstance(env.unwrapped, TaskVectorEnv)
-    assert env.unwrapped.config == SIX_TICKS
+    assert env.unwrapped.task.config == SIX_TICKS
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     obs, _ = env.reset(seed=0)
     assert env.observation_space.contains(obs)

@@ -5,15 +5,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_machines import POSE, numbered_history, pids, small_net
+from helpers_machines import POSE, closed_form, numbered_history, pids, small_net
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.random import default_rng
+from scipy import stats
 from strategies import machines
 
 from brokk_min import env
 from brokk_min.actuator import PLANT
 from brokk_min.kinematics import forward_kinematics, lowest_point, tool_position, tool_velocity
-from brokk_min.learning.episodes import new_goals, reset
 from brokk_min.machine import BROKK_170
 from brokk_min.settings import TaskConfig
 
@@ -105,13 +106,13 @@ def test_velocity_deviations__are_those_of_the_task():
     v_std, q_dot_std = env.velocity_deviations(BROKK_170)
     np.testing.assert_allclose(v_std, 0.3 * (0.85 / 9) ** 0.5, rtol=0.02)
     pid = pids(BROKK_170, small_net(BROKK_170, np.random.default_rng(0)))["jacobian_pid_k0.1"]
-    rng, config = np.random.default_rng(0), TaskConfig()
-    state, memory = reset(BROKK_170, config, rng, 64), pid.start(64)
+    rng, task = default_rng(0), env.Task(BROKK_170, PLANT, TaskConfig(), env.PAPER)
+    state, memory = env.reset(task, rng, 64).state, pid.start(64)
     seen = []
     for _ in range(300):
         u, memory = pid(env.measure(BROKK_170, state.history, state.v_goal), memory)
         state = env.transition(BROKK_170, PLANT, state, u)
-        state = new_goals(BROKK_170, config, state, rng)
+        state = env.new_goals(task, rng, state)
         seen.append(np.concatenate([state.v_tool, state.q_dot, u], axis=-1))
     found = np.std(seen, axis=(0, 1))
     np.testing.assert_allclose(found[:3], v_std, rtol=0.2)
@@ -189,3 +190,49 @@ def test_transition__on_a_plant_of_ones_own_by_hand():
     for name in ("history", "v_goal", "v_tool", "lowest"):
         assert getattr(after, name).dtype == np.float32, name
     assert after.q.dtype == after.q_dot.dtype == np.float64
+
+
+# --- episodes -------------------------------------------------------------------------------------
+
+
+def test_draw_pose__is_uniform_and_sometimes_in_the_ground():
+    low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
+    poses = env.draw_pose(BROKK_170, TaskConfig(), default_rng(0), 2000)
+    for fraction in ((poses - low) / (high - low)).T:
+        assert stats.kstest(fraction, "uniform").pvalue > 1e-3
+    assert 0.02 < (closed_form(poses)[1] < 0).mean() < 0.98
+
+
+def test_draw_goal__has_the_configured_fractions_speeds_and_directions():
+    config = TaskConfig(zero_goals=0.2, axis_goals=0.5)
+    goals = env.draw_goal(BROKK_170, config, default_rng(6), 20_000)
+    speed = np.linalg.norm(goals, axis=-1)
+    components = np.count_nonzero(goals, axis=-1)
+    for number, fraction in ((0, 0.2), (1, 0.5), (3, 0.3)):
+        assert np.mean(components == number) == pytest.approx(fraction, abs=0.02)
+    assert speed.max() <= 0.3 + 1e-12
+    assert stats.kstest(speed[components > 0] / 0.3, "uniform").pvalue > 1e-3
+    along = np.sign(goals[components == 1])
+    for axis in (*np.eye(3), *-np.eye(3)):
+        assert np.mean((along == axis).all(-1)) == pytest.approx(1 / 6, abs=0.02)
+    directions = goals[components == 3] / speed[components == 3, None]
+    moments = directions.T @ directions / len(directions)
+    np.testing.assert_allclose(moments, np.eye(3) / 3, atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "ticks"), [(0.0, 1), (0.06, 1), (0.12, 2), (0.13, 3), (0.5, 10)]
+)
+def test_draw_hold__is_whole_ticks_and_at_least_one(seconds, ticks):
+    config = TaskConfig(hold_min_s=seconds, hold_max_s=seconds)
+    assert env.draw_hold(BROKK_170, config, default_rng(0), 3).tolist() == [ticks] * 3
+
+
+def test_draw_noise__is_uniform_up_to_the_largest():
+    noise = env.draw_noise(BROKK_170, TaskConfig(), default_rng(0), 400)
+    assert noise.dtype == np.float32 and noise.shape == (
+        400,
+        env.observation_table(BROKK_170).measured.sum(),
+    )
+    assert np.abs(noise).max() <= 0.05
+    assert stats.kstest(noise[:, 7] / 0.1 + 0.5, "uniform").pvalue > 1e-3

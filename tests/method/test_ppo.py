@@ -252,7 +252,7 @@ def test_train__is_the_algorithm_of_the_paper(target_kl, rates):
     config = replace(SMALL, clip=0.02, target_kl=target_kl or 10.0)
     tape = Tape()
     start = ppo.begin(tape, config, 7)
-    start.optimizer.param_groups[0]["peak_lr"] = rates[0]
+    start = start._replace(learning_rate=rates[0])
     found = []
 
     def on_update(now, rollout, metrics):

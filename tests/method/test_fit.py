@@ -1,4 +1,4 @@
-"""Excitation: the commands, the segments, and the recordings for validation."""
+"""Recording under sines and under rich excitation; windows; the fit by the paper."""
 
 from itertools import pairwise
 from types import SimpleNamespace
@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from brokk_min.actuator import PLANT
-from brokk_min.identification.excitation import collect, rich_command, sine_command, task_log
-from brokk_min.identification.logs import velocity_of
+from brokk_min.beyond.rich_excitation import RICH, rich_command
+from brokk_min.fit import SINE, collect, sine_command, velocity_of
+from brokk_min.identification.validation import task_log
 from brokk_min.machine import BROKK_170, read_encoder
 
 LIMIT = 80 / 127
@@ -56,10 +57,10 @@ def is_replay(recording, plant, start):
 SLOW = SimpleNamespace(reset=PLANT.reset, step=lambda m, state, u: PLANT.step(m, state, u / 2))
 
 
-@pytest.mark.parametrize(("kind", "plant"), [("sine", SLOW), ("sine", PLANT), ("rich", PLANT)])
+@pytest.mark.parametrize(("kind", "plant"), [(SINE, SLOW), (SINE, PLANT), (RICH, PLANT)])
 def test_collect__drives_each_joint_alone_for_the_requested_time(kind, plant):
     """Also on a plant of one's own, which gets half of each command."""
-    log = collect(BROKK_170, 0.05, kind, np.random.default_rng(7), plant)
+    log = collect(BROKK_170, 0.05, np.random.default_rng(7), plant, kind)
     tick = 0.05 * BROKK_170.q_dot_max + 0.01
     assert log.joints == BROKK_170.names and log.rate == 20.0
     assert len({recording.name for recording in log.recordings}) == len(log.recordings)
@@ -75,8 +76,8 @@ def test_collect__drives_each_joint_alone_for_the_requested_time(kind, plant):
         np.testing.assert_allclose(angles, np.rint(angles), atol=1e-6)
         np.testing.assert_array_equal(segment.q_dot, velocity_of(segment.q, 4))
         assert not segment.u[:13].any() and not np.ptp(segment.q[:14], axis=0).any()
-        assert kind == "rich" or abs(segment.q[0, joint] - (LOW + HIGH)[joint] / 2) < 0.12
-    if kind == "sine":
+        assert kind is RICH or abs(segment.q[0, joint] - (LOW + HIGH)[joint] / 2) < 0.12
+    if kind is SINE:
         is_replay(log.recordings[-1], plant, (LOW + HIGH) / 2)
     assert ticks.tolist() == [3600] * 5  # 0.05 h at 20 Hz
     pairs = [pair for pair, after in pairwise(segments(log)) if pair[0] == after[0]]
