@@ -20,7 +20,7 @@ import numpy as np
 import benchmarks  # noqa: F401, before NumPy computes: one thread
 from brokk_min import env
 from brokk_min.actuator import PLANT, ActuatorNet, Plant
-from brokk_min.beyond.interface import INTERFACE
+from brokk_min.beyond.interface import OurInterface
 from brokk_min.evaluation import metrics, sequences
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning import policy
@@ -51,11 +51,9 @@ def interface_of(steps: frozenset[str]) -> env.Interface:
     """The paper's interface with those parts of ours that the steps name."""
     if not steps & {"observation", "command", "cost"}:
         return env.PAPER
-    mixed = replace(env.PAPER, remember=INTERFACE.remember)
-    if "observation" in steps:
-        mixed = replace(mixed, scale=INTERFACE.scale, observe=INTERFACE.observe)
-    ours = {name: getattr(INTERFACE, name) for name in steps & {"command", "cost"}}
-    return replace(mixed, **ours)
+    observation = {"scale", "observe"} if "observation" in steps else set()
+    ours = {"remember"} | observation | (steps & {"command", "cost"})
+    return type("Mixed", (env.Interface,), {name: vars(OurInterface)[name] for name in ours})()
 
 
 def climb(name: str, nets: dict[str, ActuatorNet], total_steps: int, seed: int) -> list[float]:

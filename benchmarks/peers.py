@@ -33,7 +33,7 @@ from brokk_min.beyond.interface import INTERFACE
 from brokk_min.evaluation.baselines import read_gains
 from brokk_min.evaluation.rollout import Controller, rollout
 from brokk_min.evaluation.sequences import tuning_set
-from brokk_min.learning.checkpoint import stagger_episodes
+from brokk_min.learning.checkpoint import Env, stagger_episodes
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.learning.recipes import find_recipe
@@ -73,7 +73,7 @@ class Options:
     search: int = 0  # So many settings of each, instead of a race.
 
 
-def ours(env: TaskVectorEnv, config: PPOConfig, seed: int, report: Report) -> None:
+def ours(env: Env, config: PPOConfig, seed: int, report: Report) -> None:
     """PPO with groups or with a critic: the kind of the environment decides."""
     groups = isinstance(env, GroupVectorEnv)
     advantages: ppo.Advantages = group_advantages if groups else ppo.critic_advantages
@@ -82,7 +82,7 @@ def ours(env: TaskVectorEnv, config: PPOConfig, seed: int, report: Report) -> No
     ppo.train(env, config, seed, advantages, lambda now, *_: report(now.agent.actor), start)
 
 
-def sb3(env: TaskVectorEnv, config: PPOConfig, seed: int, report: Report) -> None:
+def sb3(env: Env, config: PPOConfig, seed: int, report: Report) -> None:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -123,7 +123,7 @@ def sb3(env: TaskVectorEnv, config: PPOConfig, seed: int, report: Report) -> Non
         report([*model.policy.mlp_extractor.policy_net, model.policy.action_net])
 
 
-def cleanrl(env: TaskVectorEnv, config: PPOConfig, seed: int, report: Report) -> None:
+def cleanrl(env: Env, config: PPOConfig, seed: int, report: Report) -> None:
     """The loop of CleanRL's ppo_continuous_action.py, with the paper's nets."""
     torch.manual_seed(seed)
     inputs, actions = len(INTERFACE.scale(M)[0]), len(M.driven)
@@ -230,10 +230,9 @@ def run(name: str, settings: dict[str, Any], clock: Clock) -> None:
     recipe = find_recipe(critic=not groups)
     rates = {"target_kl": PPOConfig.target_kl, **settings}  # for all the same
     config = replace(recipe.learner, total_steps=options.steps, **rates)
-    simulation = (config.num_envs, clock.net, M, recipe.task, INTERFACE)
-    env = TaskVectorEnv(*simulation)
+    env: Env = TaskVectorEnv(config.num_envs, clock.net, M, recipe.task, INTERFACE)
     if groups:
-        env = GroupVectorEnv(*simulation, horizon=config.horizon)
+        env = GroupVectorEnv(env, config.horizon)
     clock.start()
     with contextlib.suppress(Finished):
         LEARNERS[name](env, config, options.seed, clock.report)

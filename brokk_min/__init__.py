@@ -4,8 +4,8 @@ The chain goes from a machine to logs, to actuator nets, to a policy, and to a c
 machine. "Simulation" is the learned nets, "machine" the analytic plant or a real machine on the
 bus. Nets learn from logs alone, and policies on the nets. Nothing here is a safety function.
 
-Read the files of this folder in the order machine, kinematics, actuator, jacobian, settings, env,
-ppo, hw. They hold the paper's method. `beyond` holds our improvements, one file each.
+Read the files of this folder in the order machine, kinematics, actuator, fit, jacobian, settings,
+env, ppo, hw. They hold the paper's method. `beyond` holds our improvements, one file each.
 
 Conventions: SI units and radians; the base frame has z up; joints are in the order of
 `Machine.joints`; the last axis of an array runs over joints or x, y, z, leading axes are batches.

@@ -261,8 +261,8 @@ class TrainingSet:
         kind: Callable[..., ActuatorNet] = ActuatorNet,
     ) -> ActuatorNet:
         """Nets of a `kind` with these weights; what is kept beside them says how they were made."""
-        names = ("input_mean", "input_scale", "output_low", "output_high")
-        scales = {name: getattr(self, name).numpy() for name in names}
+        keys = ("input_mean", "input_scale", "output_low", "output_high")
+        scales = {key: getattr(self, key).numpy() for key in keys}
         m, training = self.machine, {"seed": seed, "settings": asdict(config)}
         about = (self.log.joints, m.history, self.rate, m.velocity_samples, name)
         return kind(*about, **scales, weights=weights, training=training)

@@ -197,6 +197,48 @@ def begin(env: VectorEnv[Any, Any, Any], config: PPOConfig, seed: int) -> Checkp
     return Checkpoint(agent, optimizer, obs, 0, 0, config.learning_rate)
 
 
+def make_batch(
+    agent: Agent, rollout: Rollout, advantages: Tensor, returns: Tensor | None, update: int
+) -> dict[str, Tensor]:
+    """The steps of a rollout in one row, (T * N, ...); returns also scale the critic's output."""
+    batch = {"obs": rollout.obs, "actions": rollout.actions, "logprobs": rollout.logprobs}
+    batch["advantages"] = advantages
+    if returns is not None:
+        batch["returns"] = returns
+        agent.return_mean += (returns.mean() - agent.return_mean) / update  # of all batches
+        agent.return_var += (returns.var() - agent.return_var) / update
+    return {name: tensor.flatten(0, 1) for name, tensor in batch.items()}
+
+
+def improve(
+    agent: Agent, optimizer: torch.optim.Optimizer, batch: dict[str, Tensor], config: PPOConfig
+) -> dict[str, float]:
+    """`epochs` passes over a batch in minibatches; means of what `ppo_loss` says of them."""
+    parts = []
+    for _ in range(config.epochs):
+        b_inds = torch.randperm(len(batch["obs"]))
+        for mb_inds in torch.split(b_inds, config.minibatch_size):
+            mb = {name: tensor[mb_inds] for name, tensor in batch.items()}
+            loss, part = ppo_loss(agent, mb, config)
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(agent.parameters(), config.max_grad_norm)
+            optimizer.step()
+            parts.append(part)
+    names = ("policy_loss", "value_loss", "approx_kl", "clipfrac")
+    means = torch.stack(parts).mean(dim=0).tolist()
+    return {f"losses/{name}": mean for name, mean in zip(names, means, strict=True)}
+
+
+def steered(learning_rate: float, approx_kl: float, config: PPOConfig) -> float:
+    """Lower after a large change of the policy, higher after a small one, as rl_games does."""
+    if approx_kl > 1.5 * config.target_kl:
+        return learning_rate / 1.2
+    if approx_kl < 0.7 * config.target_kl:
+        return min(1.2 * learning_rate, config.learning_rate)
+    return learning_rate
+
+
 def train(
     env: VectorEnv[Any, Any, Any],
     config: PPOConfig,
@@ -212,52 +254,23 @@ def train(
     CleanRL's names. `start` is a checkpoint to go on from, in place of a new agent by `seed`.
     ValueError: a loss that is not finite.
     """
-    start = start or begin(env, config, seed)
-    agent, optimizer, obs, global_step, update, learning_rate = start
+    agent, optimizer, obs, global_step, update, rate = start or begin(env, config, seed)
     while global_step < config.total_steps:
         done = global_step / config.total_steps
-        optimizer.param_groups[0]["lr"] = learning_rate * (1 - done)
+        optimizer.param_groups[0]["lr"] = rate * (1 - done)
         if config.log_std_end is not None:
             agent.log_std.data.fill_(config.log_std + (config.log_std_end - config.log_std) * done)
         rollout, obs = collect(env, agent, obs, config.horizon)
         global_step += config.horizon * env.num_envs
         update += 1
-
-        advantages, returns = advantage_function(agent, rollout, config)
-        batch = {"obs": rollout.obs, "actions": rollout.actions, "logprobs": rollout.logprobs}
-        batch["advantages"] = advantages
-        if returns is not None:
-            batch["returns"] = returns
-            agent.return_mean += (returns.mean() - agent.return_mean) / update  # of all batches
-            agent.return_var += (returns.var() - agent.return_var) / update
-        batch = {name: tensor.flatten(0, 1) for name, tensor in batch.items()}
-
-        parts = []
-        for _ in range(config.epochs):
-            b_inds = torch.randperm(len(batch["obs"]))
-            for mb_inds in torch.split(b_inds, config.minibatch_size):
-                mb = {name: tensor[mb_inds] for name, tensor in batch.items()}
-                loss, part = ppo_loss(agent, mb, config)
-                optimizer.zero_grad()
-                loss.backward()  # type: ignore[no-untyped-call]
-                nn.utils.clip_grad_norm_(agent.parameters(), config.max_grad_norm)
-                optimizer.step()
-                parts.append(part)
-
-        names = ("policy_loss", "value_loss", "approx_kl", "clipfrac")
-        means = torch.stack(parts).mean(dim=0).tolist()
-        if not math.isfinite(sum(means)):
-            raise ValueError(f"loss: expected finite numbers at step {global_step}, got {means}")
-        metrics = {f"losses/{name}": mean for name, mean in zip(names, means, strict=True)}
+        batch = make_batch(agent, rollout, *advantage_function(agent, rollout, config), update)
+        metrics = improve(agent, optimizer, batch, config)
+        if not math.isfinite(sum(metrics.values())):
+            raise ValueError(f"loss: expected finite numbers at step {global_step}, got {metrics}")
         metrics["charts/reward"] = float(rollout.rewards.mean())
         metrics["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
-        # lower the rate after a large change of the policy, raise it after a small one, in the
-        # manner of rl_games
-        if metrics["losses/approx_kl"] > 1.5 * config.target_kl:
-            learning_rate /= 1.2
-        elif metrics["losses/approx_kl"] < 0.7 * config.target_kl:
-            learning_rate = min(1.2 * learning_rate, config.learning_rate)
-        now = Checkpoint(agent, optimizer, obs, global_step, update, learning_rate)
+        rate = steered(rate, metrics["losses/approx_kl"], config)
+        now = Checkpoint(agent, optimizer, obs, global_step, update, rate)
         on_update(now, rollout, metrics)
     return agent
 

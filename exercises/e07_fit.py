@@ -30,7 +30,7 @@ from brokk_min.actuator import (
 from brokk_min.machine import BROKK_170, Array, read_encoder
 from exercises.verdict import WrongAnswer, expect
 
-SOLUTION = "brokk_min/identification/fitting.py: fit; brokk_min/actuator.py: ActuatorNet"
+SOLUTION = "brokk_min/fit.py: fit; brokk_min/actuator.py: ActuatorNet"
 H, DT, WINDOW = BROKK_170.history, BROKK_170.dt, BROKK_170.velocity_samples
 Predict = Callable[[Array], Array]  # inputs (N, 39) -> velocities [rad/s] (N,)
 

@@ -129,18 +129,18 @@ def pid() -> Rows:
 def task() -> Rows:
     """Some ticks of the task on the plant; arm 2 begins in the ground, arm 3 near it."""
     poses = [START, [0.0, 0.0, -0.3, 2.2, 1.0], [0.4, 0.3, 0.0, 2.4, 0.9]]
-    config, rows = env.TaskConfig(episode_s=0.5), {}
-    state = env.initial_state(BROKK, poses, [0.1, 0.0, 0.1])
-    u = env.action_to_pwm(BROKK, np.tile([0.0, -0.5, -1.0, 0.5], (3, 1)))
+    config, rows, rng = env.TaskConfig(episode_s=0.5, noise=0.0), {}, np.random.default_rng(0)
+    task = env.Task(BROKK, actuator.PLANT, config, env.PAPER)
+    now = env.look(task, rng, env.initial_state(BROKK, poses, [0.1, 0.0, 0.1]), None)
+    actions = np.tile([0.0, -0.5, -1.0, 0.5], (3, 1))
     for tick in range(1, 13):
-        state, reward, terminated, truncated = env.step(BROKK, config, actuator.PLANT, state, u)
+        now, reward, terminated, truncated, _ = env.tick(task, rng, now, actions)
         if tick in (1, 2, 9, 12):
             rows[f"tick {tick}, rewards"] = reward
             rows[f"tick {tick}, ends (1 terminated, 2 truncated)"] = terminated + 2 * truncated
-    obs = env.features(BROKK, env.measure(BROKK, state.history, state.v_goal))
-    rows["commands of the actions 0, -0.5, -1, 0.5 [counts]"] = u[0] * 127
-    rows["observation of arm 1, numbers 0 to 6"] = obs[0, :7]
-    rows["mean and deviation of its history"] = [obs[0, 7:].mean(), obs[0, 7:].std()]
+    rows["commands of the actions 0, -0.5, -1, 0.5 [counts]"] = now.state.history[0, :, 2, -1] * 127
+    rows["observation of arm 1, numbers 0 to 6"] = now.obs[0, :7]
+    rows["mean and deviation of its history"] = [now.obs[0, 7:].mean(), now.obs[0, 7:].std()]
     return rows
 
 

@@ -27,7 +27,7 @@ ROW = re.compile(r"^\| \[`(\w+)\.py`\]\(brokk_min/\1\.py\) \| (\d+) \|", re.M)
 def test_readme__lists_the_files_of_the_method_with_their_lines() -> None:
     text = README.read_text()
     assert counted(text) == text, "run `python tests/paper/test_docs.py`"
-    listed = ["__init__", "machine", "kinematics", "actuator", "jacobian"]
+    listed = ["__init__", "machine", "kinematics", "actuator", "fit", "jacobian"]
     listed += ["settings", "env", "ppo", "hw"]
     assert [name for name, _ in ROW.findall(text)] == listed
 
