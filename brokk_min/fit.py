@@ -268,7 +268,7 @@ class TrainingSet:
         return kind(*about, **scales, weights=weights, training=training)
 
 
-def train(data: TrainingSet, config: FitConfig, seed: int) -> Weights:
+def fit_weights(data: TrainingSet, config: FitConfig, seed: int) -> Weights:
     """Weights of one net for each joint, as in `ActuatorNet.weights`. Paper: Sec. 3.3 (Adam)"""
     import torch
 
@@ -352,7 +352,7 @@ def fit(
     seed: int,
     machine: Machine,
     name: str = "",
-    train: Callable[[TrainingSet, FitConfig, int], Weights] = train,
+    method: Callable[[TrainingSet, FitConfig, int], Weights] = fit_weights,
 ) -> ActuatorNet:
     """The nets of each joint of a log; the same `seed` gives the same bits on one computer.
 
@@ -360,4 +360,4 @@ def fit(
     never moves long enough, or weights that are not finite at the end. Paper: Sec. 3.3
     """
     data = TrainingSet(log, machine)
-    return data.nets(train(data, config, seed), config, seed, name)
+    return data.nets(method(data, config, seed), config, seed, name)

@@ -98,7 +98,7 @@ def log_probability(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def collect(
+def collect_rollout(
     env: VectorEnv[Any, Any, Any], agent: Agent, obs: Tensor, horizon: int
 ) -> tuple[Rollout, Tensor]:
     """`horizon` ticks of all environments from observations (num_envs, obs); and the next ones."""
@@ -128,7 +128,6 @@ def gae(
 ) -> Tensor:
     """Generalised advantage estimates (Schulman et al., 2016), all tensors of shape (T, N).
 
-    delta_t = r_t + gamma V(s_{t+1}) - V(s_t);  A_t = delta_t + gamma lambda (1 - done_t) A_{t+1}.
     `values` are V(s_t), `next_values` V(s_{t+1}): 0 where the episode terminated, that of its own
     last observation where it was truncated. `dones` is 1 where it terminated or was truncated.
 
@@ -137,10 +136,11 @@ def gae(
         >>> gae(one, 0 * one, 0 * one, 0 * one, 0.5, 1.0).ravel().tolist()
         [1.5, 1.0]
     """
-    delta = rewards + gamma * next_values - values
+    delta = rewards + gamma * next_values - values  # r_t + gamma V(s_{t+1}) - V(s_t)
     advantages = torch.empty_like(delta)
     lastgaelam = torch.zeros_like(delta[0])
     for t in reversed(range(len(delta))):
+        # A_t = delta_t + gamma lambda (1 - done_t) A_{t+1}
         lastgaelam = delta[t] + gamma * lam * (1 - dones[t]) * lastgaelam
         advantages[t] = lastgaelam
     return advantages
@@ -260,7 +260,7 @@ def train(
         optimizer.param_groups[0]["lr"] = rate * (1 - done)
         if config.log_std_end is not None:
             agent.log_std.data.fill_(config.log_std + (config.log_std_end - config.log_std) * done)
-        rollout, obs = collect(env, agent, obs, config.horizon)
+        rollout, obs = collect_rollout(env, agent, obs, config.horizon)
         global_step += config.horizon * env.num_envs
         update += 1
         batch = make_batch(agent, rollout, *advantage_function(agent, rollout, config), update)

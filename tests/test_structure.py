@@ -10,12 +10,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "brokk_min"
-METHOD = ["machine", "kinematics", "actuator", "jacobian", "settings", "env", "ppo"]
+METHOD = ["machine", "kinematics", "actuator", "fit", "jacobian", "settings", "env", "ppo"]
 WINGS = ["_files", "beyond", "identification", "learning", "evaluation", "can", "viewer", "cli"]
 ORDER = [*METHOD, "hw", *WINGS, "__main__"]  # of the README: a module imports what stands before it
 BESIDE = {
     "hw": {"can.canopen", "can.connection", "can.safety_gate"},
-    "beyond.group_advantages": {"learning.episodes", "learning.gym_env"},  # its environment
     "learning.gym_env": {"viewer.drawing"},  # of `render`
 }
 MODULES = {".".join(p.relative_to(PACKAGE).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")}
@@ -45,10 +44,28 @@ def test_imports__have_no_circle():
     graphlib.TopologicalSorter({name: imports(name) for name in MODULES}).prepare()
 
 
+SECRETS = {"hydraulics", "Hydraulics", "HYDRAULICS", "Cylinder", "BROKK_CYLINDERS", "PlantState"}
+SECRETS |= {"cylinder_column", "cylinder_speeds", "lever_arm", "euler_step"}
+MAY_READ = {"actuator", "machine"}  # the plant, and the machine that has the field
+MAY_READ |= {"evaluation.reproduce", "evaluation.sequences"}  # what varies it, what is feasible
+
+
+def test_hydraulics__are_read_by_the_plant_and_by_what_varies_it_alone():
+    """Of benchmarks by the perfect model alone, which says so in its name."""
+    files = MODULES | {f"benchmarks.{p.stem}": p for p in (ROOT / "benchmarks").glob("*.py")}
+    readers = set()
+    for name, path in files.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            words = {getattr(node, field, None) for field in ("id", "attr", "name", "arg")}
+            if words & SECRETS:
+                readers.add(name)
+    assert readers == MAY_READ | {"benchmarks.perfect_model"}
+
+
 def test_importing_the_package__changes_no_environment_and_imports_no_torch():
     """Nor NumPy at first, because the program sets its threads before."""
     code = "import os, sys; before = dict(os.environ); import brokk_min"
-    code += "; print('numpy' in sys.modules); import brokk_min.env"
+    code += "; print('numpy' in sys.modules); import brokk_min.env, brokk_min.fit"
     code += "; print(dict(os.environ) == before, 'torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.split() == ["False", "True", "False"], done.stderr

@@ -16,7 +16,7 @@ with richer logs and five nets a joint, and 0.11 m with the paper's nets (median
 Who was first: NARX models and their free runs are Leontaritis and Billings' (1985), the fit of a
 model on its own outputs is the output-error method (Ljung, System Identification, 1999).
 
-It plugs in as another `fit.train`.
+It plugs in as another `fit.fit_weights`.
 """
 
 import math
@@ -32,7 +32,7 @@ from brokk_min.fit import FitConfig, TrainingSet
 from brokk_min.machine import Array
 
 
-def train(
+def fit_weights(
     data: TrainingSet,
     config: FitConfig,
     seed: int,

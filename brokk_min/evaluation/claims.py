@@ -14,11 +14,11 @@ import numpy as np
 
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, RAW
 from brokk_min.evaluation.metrics import Mean, Run, by_start, mean_interval
-from brokk_min.evaluation.preliminary import Motion, Tests, response_time
+from brokk_min.evaluation.preliminary import Gap, Tests, response_time
 from brokk_min.evaluation.rollout import TITLES
 
 TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-POLICIES = ("rl_paper", "rl_critic")  # the paper's agent
+JUDGED = ("rl_paper", "rl_critic")  # the paper's agent
 PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure, by hand first
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
 SHORT = {ERROR: "error", DRIFT: "drift"}  # in columns
@@ -43,7 +43,7 @@ def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any
     return known | {"numbers": numbers, "verdicts": verdicts}
 
 
-def net_claims(nets: Tests, gap: Motion) -> list[dict[str, Any]]:
+def net_claims(nets: Tests, gap: Gap) -> list[dict[str, Any]]:
     """Do the nets behave as the paper's machine? Paper: Sec. 3.2 and 4.1, Fig. 2 and 5"""
     _, up, down, _ = (np.abs(q_dot).max() for _, q_dot in nets["range and direction"].values())
     idle, moving = (response_time(*curve) for curve in nets["past movement"].values())
@@ -70,7 +70,7 @@ def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
     def less(sequences: Sequence[str], keys: Sequence[str] = (ERROR,)) -> dict[str, Any]:
         """Figures of each policy less those of each PID: negative where the policy is better."""
         numbers: dict[str, dict[str, Mean]] = {}
-        for policy, pid in product(POLICIES, PIDS):
+        for policy, pid in product(JUDGED, PIDS):
             row = numbers[f"{TITLES[policy]} against {TITLES[pid]}"] = {}
             for s, key in product(sequences, keys):
                 difference = by_start(runs, policy, s, key) - by_start(runs, pid, s, key)
@@ -78,7 +78,7 @@ def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
         return numbers
 
     return [
-        claim("still", drift(POLICIES)),
+        claim("still", drift(JUDGED)),
         claim("drift", drift(PIDS)),
         claim("tracking", less("xyz")),
         claim("along_z", less("z", (ERROR, DRIFT))),

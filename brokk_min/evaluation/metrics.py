@@ -20,7 +20,7 @@ from brokk_min.settings import TaskConfig
 Controllers = Mapping[str, Controller]  # by name
 Traces = Mapping[tuple[str, str], Trace]  # by controller and sequence, starts as one batch
 Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures of `metrics`
-Rows = list[dict[str, Any]]  # of one `Run` each
+Table = list[dict[str, Any]]  # of one `Run` each
 Mean = Mapping[str, float | None]  # "mean", and its interval "low" to "high"
 LABELS = ("controller", "sequence", "start", "kind", "seed")  # of a row; the seed is of a sweep
 COLUMNS = {  # of tables, with their heads
@@ -80,7 +80,7 @@ def evaluate(
     starts: Array,
     seed: int,
     plant: Plant = PLANT,
-) -> tuple[Rows, Traces]:
+) -> tuple[Table, Traces]:
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
     `starts` are angles [rad] (starts, n). The sensors have the noise of training. Returns one row
@@ -91,7 +91,7 @@ def evaluate(
     ticks = max(len(of) for of in goals.values())
     padded = [np.pad(of, ((0, ticks - len(of)), (0, 0), (0, 0))) for of in goals.values()]
     q, batch = np.tile(starts, (len(goals), 1)), np.concatenate(padded, axis=1)
-    rows: Rows = []
+    rows: Table = []
     traces: dict[tuple[str, str], Trace] = {}
     for name, controller in tqdm(controllers.items(), "evaluate", unit="controller", disable=None):
         rng = np.random.default_rng(seed)

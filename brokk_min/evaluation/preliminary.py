@@ -13,7 +13,7 @@ from brokk_min.identification.validation import task_log
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import PWM_MAX, Array, Machine, encode_pwm
 
-SLOW = 5 / 8  # of the command limit, paper: 50 of 80 counts
+PART = 5 / 8  # of the command limit, paper: 50 of 80 counts
 SWEEP_S = 40.0  # s, assumed: long enough for a slow joint at the slow command
 RISE = 0.63  # paper's response times: 0.4 s and 0.1 s, read as the time to 63 % of the change
 GAP_S = 30.0  # s, paper
@@ -23,7 +23,7 @@ Curves = Mapping[str, tuple[Array, Array]]  # x and y, (T,) each
 Tests = Mapping[str, Curves]  # the curves of each of the paper's tests
 
 
-class Motion(NamedTuple):
+class Gap(NamedTuple):
     """The difference of two motions, (T, runs, ...)."""
 
     q: Array  # rad, (..., n)
@@ -49,7 +49,7 @@ def preliminary_tests(machine: Machine, plant: Plant) -> Tests:
     angles [rad] are by PWM byte, and at the limit alone or with others. Paper: Sec. 3.2, Fig. 2
     """
     joint, others = machine.driven[-1], machine.driven[:-1]
-    slow, limit = np.array([round(SLOW * machine.pwm_limit), machine.pwm_limit]) / PWM_MAX
+    slow, limit = np.array([round(PART * machine.pwm_limit), machine.pwm_limit]) / PWM_MAX
     u = np.zeros((5, machine.n))
     u[:, joint] = [slow, limit, -limit, -slow, limit]
     u[4, others] = -limit
@@ -97,7 +97,7 @@ def response_time(time: Array, velocity: Array) -> float | None:
     return max(float(np.interp(RISE * change.max(), change[pair], time[pair])), 0.0)
 
 
-def sim_to_real(machine: Machine, both: Mapping[str, Plant], seed: int) -> Motion:
+def sim_to_real(machine: Machine, both: Mapping[str, Plant], seed: int) -> Gap:
     """Nets less machine under commands that move several joints. Paper: Sec. 4.1, Fig. 5"""
     middle = (machine.column("q_min") + machine.column("q_max")) / 2
     start = np.array(machine.q_start or middle)
@@ -109,4 +109,4 @@ def sim_to_real(machine: Machine, both: Mapping[str, Plant], seed: int) -> Motio
     tools = {name: tool_position(forward_kinematics(machine, of)) for name, of in angles.items()}
     q, p = (of["nets"] - of["machine"] for of in (angles, tools))  # (T + 1, runs, ...)
     q_dot, v = (np.diff(x, axis=0) * machine.rate for x in (q, p))
-    return Motion(q[1:], q_dot, p[1:], v)
+    return Gap(q[1:], q_dot, p[1:], v)

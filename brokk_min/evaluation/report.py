@@ -18,7 +18,7 @@ from tqdm import tqdm
 from brokk_min._files import SHIPPED, whole_file
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST
 from brokk_min.evaluation.metrics import COLUMNS, Mean, Traces, interval_text
-from brokk_min.evaluation.preliminary import Curves, Motion, Tests
+from brokk_min.evaluation.preliminary import Curves, Gap, Tests
 from brokk_min.evaluation.rollout import TITLES, valves_at_rest
 from brokk_min.evaluation.sequences import AXES, Commands, axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
@@ -26,7 +26,7 @@ from brokk_min.machine import BROKK_170, Array, Machine
 
 Results = Mapping[str, Any]  # of `results.json`
 Row = tuple[Sequence[str], Mapping[str, Array]]  # of plots: labels, and curves (T, labels) by name
-Measured = tuple[Mapping[str, Tests], Motion, Traces]  # of machine and nets, nets less machine
+Shown = tuple[Mapping[str, Tests], Gap, Traces]  # of machine and nets, nets less machine
 ROWS = (BY_HAND, OPTIMISED, "rl_paper", "rl", STRONGEST)
 PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
 SAMPLE = ("rl_paper", "rl_critic", BY_HAND, OPTIMISED)  # drawn in Fig. 6
@@ -36,7 +36,7 @@ LINES = ("-", "--", "-.", ":")  # beside colours, for the colour-blind
 
 
 @style.context("default")  # not the settings of the owner for his own pictures
-def write_report(out: Path, machine: Machine, results: Results, measured: Measured) -> None:
+def write_report(out: Path, machine: Machine, results: Results, measured: Shown) -> None:
     """Write `report.html` to the folder `out`; `measured` is what the paper's figures show."""
     tests, gap, traces = measured
     starts, table = np.array(results["starts"]), first_table(results)
@@ -81,7 +81,7 @@ def render(results: Results, images: Mapping[str, str]) -> str:
 # --- figures --------------------------------------------------------------------------------------
 
 
-def draw(ax: Axes, curves: Curves, xlabel: str, ylabel: str, title: str = "") -> None:
+def draw_curves(ax: Axes, curves: Curves, xlabel: str, ylabel: str, title: str = "") -> None:
     """Curves with their labels, and titles of the axes with units."""
     for i, (label, (x, y)) in enumerate(curves.items()):
         line = LINES[i % len(LINES)]
@@ -98,7 +98,7 @@ def plot_over_time(dt: float, rows: Sequence[Row], share: bool = True) -> Figure
     for row, (labels, curves) in zip(axes, rows, strict=True):
         for i, label in enumerate(labels):
             columns = {name: (dt * np.arange(1, len(y) + 1), y[:, i]) for name, y in curves.items()}
-            draw(row[i], columns, "time [s]", label)
+            draw_curves(row[i], columns, "time [s]", label)
     axes[0, 0].legend(fontsize="small")
     return figure
 
@@ -111,12 +111,12 @@ def plot_tests(machine: Machine, both: Mapping[str, Tests]) -> Figure:
     for row, (kind, tests) in zip(axes, both.items(), strict=True):
         for ax, (test, curves) in zip(row, tests.items(), strict=True):
             xlabel = "time after the step [s]" if test == "past movement" else f"{joint} [rad]"
-            draw(ax, curves, xlabel, f"velocity {joint} [rad/s]", f"{kind}: {test}")
+            draw_curves(ax, curves, xlabel, f"velocity {joint} [rad/s]", f"{kind}: {test}")
             ax.legend(fontsize="small")
     return figure
 
 
-def plot_gap(machine: Machine, gap: Motion) -> Figure:
+def plot_gap(machine: Machine, gap: Gap) -> Figure:
     """Nets less machine under the same commands: tool, and a row for each joint. Paper: Fig. 5"""
     moved = {"tool": ("m", norm(gap.v_tool, axis=-1), norm(gap.p_tool, axis=-1))}
     moved |= {machine.names[i]: ("rad", gap.q_dot[..., i], gap.q[..., i]) for i in machine.driven}

@@ -57,8 +57,8 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     """
     chain = Chain(machine, out, budget, seed)
     out.mkdir(parents=True, exist_ok=True)
-    done = learn(chain, record(chain, RICH, "log"), record(chain, SINE, "log_paper"))
-    results, measured = measure(chain, done)
+    done = learn(chain, record_log(chain, RICH, "log"), record_log(chain, SINE, "log_paper"))
+    results, measured = measure_all(chain, done)
     write_json(out / "results.json", results)
     write_json(out / "table.json", {key: results[key] for key in ("meta", "table")})
     baselines.write_gains(out / "gains.json", done["pids"], results["meta"])
@@ -66,7 +66,7 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     return results
 
 
-def record(chain: Chain, excitation: Excitation, name: str) -> Log:
+def record_log(chain: Chain, excitation: Excitation, name: str) -> Log:
     """A log to fit nets to, written to `name`.npz and read back as a user's would be."""
     machine, file = chain.machine, chain.out / f"{name}.npz"
     rng = np.random.default_rng(chain.seed)
@@ -82,7 +82,7 @@ def fit_net(chain: Chain, name: str, log: Log, recipe: Mapping[str, Any]) -> Act
     return net
 
 
-def train(chain: Chain, name: str, net: ActuatorNet) -> Policy:
+def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     """One of `POLICIES`, by its own recipe."""
     recipe = find_recipe(paper=name != "rl", critic=name == "rl_critic")
     steps = chain.budget.train_steps or recipe.learner.total_steps
@@ -97,16 +97,16 @@ def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
     jobs: dict[str, Callable[..., Any]] = {
         "net": partial(fit_net, chain, "net", log, {}),
         "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
-        "rl_paper": partial(train, chain, "rl_paper"),  # the longest first
-        "rl_critic": partial(train, chain, "rl_critic"),
-        "rl": partial(train, chain, "rl"),
+        "rl_paper": partial(train_one, chain, "rl_paper"),  # the longest first
+        "rl_critic": partial(train_one, chain, "rl_critic"),
+        "rl": partial(train_one, chain, "rl"),
         "pids": partial(tune, effort=chain.budget.tuning, seed=chain.seed),
     }
     needs = {"rl_paper": ["net"], "rl_critic": ["net_paper"], "rl": ["net"], "pids": ["net"]}
     return side_by_side(jobs, needs)
 
 
-def measure(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], report.Measured]:
+def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], report.Shown]:
     """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
     net = select_nets(machine, done["net"])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from brokk_min._files import expect_same, write_json
 from brokk_min.actuator import ActuatorNet
-from brokk_min.evaluation.metrics import Mean, Rows, evaluate, means, metadata
+from brokk_min.evaluation.metrics import Mean, Table, evaluate, means, metadata
 from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import train_policy
@@ -44,7 +44,7 @@ def sweep(
 
 def run_seed(
     machine: Machine, net: ActuatorNet, recipe: Recipe, out: Path, starts: int, seed: int
-) -> Rows:
+) -> Table:
     """Train one seed, unless it is, and score it on the sequences and starts of `evaluate`.
 
     ValueError: the folder `out` has a policy of this seed from another training.

@@ -29,17 +29,17 @@ def fit_nets(
     """
     if not (name and config.valve):
         config = replace(config, valve=False, members=1)
-    train = paper.train
+    method = paper.fit_weights
     if config.rollout > 1 or config.weight_decay or config.newest_only:
         ours: Any = {name: getattr(config, name) for name in ("weight_decay", "newest_only")}
-        train = partial(free_runs.train, ticks=config.rollout, **ours)
+        method = partial(free_runs.fit_weights, ticks=config.rollout, **ours)
     if not config.valve:
-        return paper.fit(log, config, seed, machine, name, train)
+        return paper.fit(log, config, seed, machine, name, method)
     index = [machine.names.index(joint) for joint in log.joints]
     zones = machine.dead_zones[index].astype(np.float32)
     data = paper.TrainingSet(log, machine, valve_reader(zones))
     seeds = range(seed * config.members, (seed + 1) * config.members)
-    each = [train(data, config, one) for one in seeds]
+    each = [method(data, config, one) for one in seeds]
     if config.members == 1:
         return data.nets(each[0], config, seed, name, partial(ValveNet, dead_zones=zones))
     weights = tuple(np.stack(of, axis=1) for of in zip(*each, strict=True))

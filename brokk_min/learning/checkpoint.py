@@ -25,7 +25,7 @@ from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Checkpoint, Rollout
 
 EVERY = 50  # updates between two checkpoints
-Rows = list[dict[str, float]]  # of a learning curve
+Curve = list[dict[str, float]]  # of a learning curve
 Env = VectorEnv[Any, Any, Any]  # a `TaskVectorEnv`, or groups in one
 
 
@@ -44,7 +44,7 @@ def train_policy(
     torch.set_num_threads(1)  # several wait in vain on busy cores
     config, checkpoint = recipe.learner, Path(f"{out}.checkpoint")
     env, advantages, start = prepare(machine, net, recipe, seed)
-    rows: Rows = []
+    rows: Curve = []
     if checkpoint.exists():
         start, rows = load(checkpoint, about, env, start)
 
@@ -99,7 +99,7 @@ def stagger_episodes(env: Env) -> None:
     inner.episodes = inner.episodes._replace(state=state)
 
 
-def save(path: Path, about: dict[str, Any], env: Env, now: Checkpoint, rows: Rows) -> None:
+def save(path: Path, about: dict[str, Any], env: Env, now: Checkpoint, rows: Curve) -> None:
     """Write a checkpoint from which a training continues to the same bits."""
     arrays: list[torch.Tensor] = []
     inner: Any = env.unwrapped
@@ -121,7 +121,9 @@ def save(path: Path, about: dict[str, Any], env: Env, now: Checkpoint, rows: Row
         file.write(buffer.getvalue())
 
 
-def load(path: Path, about: dict[str, Any], env: Env, fresh: Checkpoint) -> tuple[Checkpoint, Rows]:
+def load(
+    path: Path, about: dict[str, Any], env: Env, fresh: Checkpoint
+) -> tuple[Checkpoint, Curve]:
     """The training of a checkpoint and its curve, in place of a fresh one of the same settings."""
     with expected(path, "a readable checkpoint"):
         content = torch.load(path, weights_only=True)  # executes nothing

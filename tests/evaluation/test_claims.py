@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brokk_min.evaluation import claims
-from brokk_min.evaluation.preliminary import Motion
+from brokk_min.evaluation.preliminary import Gap
 from brokk_min.evaluation.rollout import TITLES
 
 HIGH, LOW, RAW = "jacobian_pid_k0.1", "pid_by_hand", "pid_by_hand_raw"
@@ -57,7 +57,7 @@ def test_net_claims__hold_where_nets_behave_as_the_papers_machine(change, expect
     }
     distances = np.array([like["figure"], like["median"], like["median"]])
     p = np.array([0.5, 1.5])[:, None, None] * distances[:, None] * [0.6, 0.8, 0.0]
-    result = claims.net_claims(nets, Motion(p, p, p, p))
+    result = claims.net_claims(nets, Gap(p, p, p, p))
     assert [claim["verdicts"] for claim in result] == [{"nets": text} for text in expected]
     assert [claim["figure"] for claim in result] == ["Fig. 2", "Fig. 2", "Fig. 5"]
     means = [n["mean"] for claim in result for n in claim["numbers"]["nets"].values()]

@@ -10,7 +10,7 @@ from helpers_machines import POSE
 
 from brokk_min._files import SHIPPED
 from brokk_min.evaluation import metrics, report
-from brokk_min.evaluation.preliminary import Motion
+from brokk_min.evaluation.preliminary import Gap
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
@@ -97,7 +97,7 @@ def test_plot_errors__has_a_row_with_an_interval_for_each_controller():
 
 
 def test_plot_gap__has_a_row_for_the_tool_and_for_each_driven_joint():
-    gap = Motion(*(RNG.normal(size=(4, 2, n)) for n in (5, 5, 3, 3)))
+    gap = Gap(*(RNG.normal(size=(4, 2, n)) for n in (5, 5, 3, 3)))
     axes = report.plot_gap(BROKK_170, gap).axes
     joints = [[f"{name} [rad/s]", f"{name} [mrad]"] for name in ("q1", "q3", "q4", "q5")]
     labels = ["tool [m/s]", "tool [mm]", *np.ravel(joints)]

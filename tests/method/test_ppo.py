@@ -111,7 +111,7 @@ def test_critic_advantages__are_means_of_n_step_returns(gamma, lam, seed):
     tape = Tape(seed)
     agent, _, obs, *_ = ppo.begin(tape, config, 0)
     agent.critic = nn.Identity()
-    rollout, _ = ppo.collect(tape, agent, obs, config.horizon)
+    rollout, _ = ppo.collect_rollout(tape, agent, obs, config.horizon)
     advantages, returns = ppo.critic_advantages(agent, rollout, config)
     rewards = (1 - gamma) * tape.rewards[:8]  # values are in units of the reward
     ends, values = (tape.terminated, tape.truncated), tape.obs[..., 0]
@@ -158,7 +158,7 @@ def test_collect__records_what_happened():
     torch.manual_seed(0)
     noise = torch.stack([torch.randn(6, 3) for _ in range(8)])
     torch.manual_seed(0)
-    rollout, _ = ppo.collect(tape, agent, obs, 8)
+    rollout, _ = ppo.collect_rollout(tape, agent, obs, 8)
     assert rollout.rewards.dtype == torch.float32
     done = tape.terminated[:8] | tape.truncated[:8]
     next_obs = np.where(done[..., None], tape.last_obs[:8], tape.obs[1:9])
