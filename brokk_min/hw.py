@@ -20,28 +20,28 @@ from brokk_min.can.canopen import Array, Operator, OperatorInput
 from brokk_min.can.connection import Bus, stop_signals
 from brokk_min.can.safety_gate import GateInputs, gate, gate_start
 from brokk_min.env import measure
-from brokk_min.machine import PWM_MAX, Machine, Measured
+from brokk_min.machine import PWM_MAX, Controller, Machine, Measured
 
 ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
 
 
 class Drive:
-    """From the operator's velocity goals, through a controller and the gate, to the valves.
-
-    `controller` is a policy or a baseline, with `start` and a call as `JacobianController` has.
-    """
+    """From the operator's velocity goals, through a controller and the gate, to the valves."""
 
     controller_state: Any  # from the first tick with all positions on
     start_time: float  # s, see `begin`
     lateness: float  # s, of the last tick
 
-    def __init__(self, machine: Machine, controller: Any, bus: Bus, operator: Operator) -> None:
+    def __init__(
+        self, machine: Machine, controller: Controller, bus: Bus, operator: Operator
+    ) -> None:
         self.machine, self.controller = machine, controller
         self.bus, self.operator = bus, operator
         self.operator_input = OperatorInput()
         self.nodes = canopen.Nodes(machine)
         self.gate = gate_start(machine)
         self.history: Array | None = None  # None after a gap
+        self.measured: Measured | None = None  # newest, arrays (1, ...); None after a gap
         self.exception = ""  # of this tick
         self.last_exception = ""  # since it drove
         self.signals: list[int] = []
@@ -100,16 +100,18 @@ class Drive:
         """The controller's command [counts of 127] (n,) at angles `counts` [encoder counts]."""
         m = self.machine
         if (self.nodes.frames != 1).any():
-            self.history = None  # samples before a gap do not join those after it
+            self.history = self.measured = None  # samples before a gap do not join those after it
             return np.zeros(m.n)
         q = (counts[None] * m.encoder_step).astype(np.float32)  # as `machine.read_encoder`
         if self.history is None:
             self.history = initial_history(q, m.history)
         else:
-            u = self.gate.sent[..., -1] / PWM_MAX  # what the gate let pass
-            self.history = append_sample(self.history, u, q, m.velocity_samples, m.dt)
+            sent = self.gate.sent[..., -1] / PWM_MAX  # what the gate let pass
+            self.history = append_sample(self.history, sent, q, m.velocity_samples, m.dt)
         if not self.gate.driving:
             self.controller_state = self.controller.start(1)
+        v_goal = np.array([self.operator_input.v_goal], np.float32)
+        self.measured = measure(m, self.history, v_goal)
         u, self.controller_state = self.controller(self.measured, self.controller_state)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
@@ -153,7 +155,7 @@ class Drive:
         self.lateness = self.bus.now() - deadline
         missed = max(0, int(self.lateness // self.machine.dt))
         if missed:
-            self.history = None  # its samples must be a tick apart
+            self.history = self.measured = None  # its samples must be a tick apart
         self.deadline_number += 1 + missed
         self.ticks += 1
 
@@ -164,11 +166,3 @@ class Drive:
             yield
         except Exception as error:
             self.exception = f"{type(error).__name__}: {error}"
-
-    @property
-    def measured(self) -> Measured | None:
-        """Newest measurements of the machine, arrays (1, ...); None after a gap."""
-        if self.history is None:
-            return None
-        v_goal = np.array([self.operator_input.v_goal], np.float32)
-        return measure(self.machine, self.history, v_goal)

@@ -9,10 +9,10 @@ from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation import baselines, metrics, sequences
-from brokk_min.evaluation.rollout import TITLES, Controller, valves_at_rest
+from brokk_min.evaluation.rollout import TITLES, valves_at_rest
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.policy import POLICIES, load_policy
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Controller, Machine
 
 
 @dataclass(kw_only=True)

@@ -16,10 +16,10 @@ from brokk_min.can.shadow import Shadow
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
-from brokk_min.evaluation.rollout import TITLES, Controller
+from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import read_commands
 from brokk_min.learning.policy import load_policy
-from brokk_min.machine import PWM_MAX, Machine, require
+from brokk_min.machine import PWM_MAX, Controller, Machine, require
 
 
 @dataclass(kw_only=True)

@@ -13,9 +13,8 @@ from brokk_min.actuator import PLANT, Plant
 from brokk_min.can.operator_input import shape_axis
 from brokk_min.can.simulated_machine import start_pose
 from brokk_min.env import initial_state, measure, transition
-from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Controller, Machine
 from brokk_min.viewer.drawing import Scene, draw
 
 SIZE = (1120, 680)  # px, of the window
