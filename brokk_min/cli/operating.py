@@ -11,13 +11,12 @@ from tyro.conf import Positional
 
 from brokk_min import hw
 from brokk_min.can.connection import open_bus
-from brokk_min.can.operator_input import JointJog, Joystick, Script
+from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
 from brokk_min.can.shadow import Shadow
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
 from brokk_min.evaluation.rollout import TITLES
-from brokk_min.evaluation.sequences import read_commands
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import PWM_MAX, Controller, Machine, require
 
@@ -84,8 +83,8 @@ class Drive(Command):
             return None
         if self.command in ("", "joystick"):
             return Joystick(machine, self.axes, self.button)
-        goals = [sequence.goals for sequence in read_commands(Path(self.command), machine)]
-        return Script(machine, np.concatenate(goals))
+        goals = read_commands(Path(self.command), machine)
+        return Script(machine, np.concatenate([*goals.values()]))
 
 
 def find_controller(machine: Machine, policy: Path | None, rl: bool) -> Controller:
