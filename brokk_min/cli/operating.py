@@ -12,13 +12,13 @@ from tyro.conf import Positional
 from brokk_min import hw
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
-from brokk_min.can.shadow import Shadow
 from brokk_min.can.simulated_machine import simulate
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import PWM_MAX, Controller, Machine, require
+from brokk_min.shadow import Shadow
 
 
 @dataclass(kw_only=True)
