@@ -16,11 +16,11 @@ import numpy as np
 
 from brokk_min.actuator import append_sample, initial_history
 from brokk_min.can import canopen
-from brokk_min.can.canopen import Array, Operator, OperatorInput
+from brokk_min.can.canopen import Counts, Operator, OperatorInput
 from brokk_min.can.connection import Bus, stop_signals
 from brokk_min.can.safety_gate import GateInputs, gate, gate_start
 from brokk_min.env import measure
-from brokk_min.machine import PWM_MAX, Controller, Machine, Measured
+from brokk_min.machine import PWM_MAX, Array, Controller, Machine, Measured
 
 ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
 
@@ -80,7 +80,7 @@ class Drive:
             answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
             self.nodes.listen(self.bus, answer_by, until_complete=True)
         counts = canopen.encoder_counts(self.machine, self.nodes.raw)
-        command = np.zeros(self.machine.n)
+        command: Array = np.zeros(self.machine.n)
         with self.catch_errors():
             command = self.control(counts)
         stop = self.operator_input.stop or bool(self.signals)
@@ -96,7 +96,7 @@ class Drive:
             self.bus.flush()
         return not self.operator_input.stop
 
-    def control(self, counts: Array) -> Array:
+    def control(self, counts: Counts) -> Array:
         """The controller's command [counts of 127] (n,) at angles `counts` [encoder counts]."""
         m = self.machine
         if (self.nodes.frames != 1).any():
@@ -115,7 +115,7 @@ class Drive:
         u, self.controller_state = self.controller(self.measured, self.controller_state)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
-    def send_command(self, command: Array, counts: Array) -> None:
+    def send_command(self, command: Array, counts: Counts) -> None:
         """Pass the safety gate, and send the valve frame once the gate was armed."""
         entered = self.operator_input
         inputs = GateInputs(

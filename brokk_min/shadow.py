@@ -11,9 +11,9 @@ import numpy as np
 
 from brokk_min import hw
 from brokk_min.can import canopen
-from brokk_min.can.canopen import Array, Operator, OperatorInput
+from brokk_min.can.canopen import Counts, Operator, OperatorInput
 from brokk_min.can.connection import Bus
-from brokk_min.machine import PWM_MAX, Controller, Machine
+from brokk_min.machine import PWM_MAX, Array, Controller, Machine
 
 EARLY = 0.15  # of a tick, by which positions may come early (assumed)
 
@@ -69,7 +69,7 @@ class Shadow(hw.Drive):
         moved_by[:, -1] = sent
         self.gate = self.gate._replace(sent=moved_by)
 
-    def control(self, counts: Array) -> Array:
+    def control(self, counts: Counts) -> Array:
         """The controller's command [counts of 127] (n,)."""
         answered = self.nodes.frames > 0
         if answered.any() and not answered.all():  # it has waited for the others

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from brokk_min import hw
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
-from brokk_min.can.simulated_machine import simulate
+from brokk_min.can.simulated_machine import run_machine
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
 from brokk_min.evaluation.rollout import TITLES
@@ -31,11 +31,11 @@ class Simulate(Command):
 
     def __call__(self, machine: Machine) -> None:
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
-        simulate(machine, self.interface, self.channel, find_plant(self.plant, machine))
+        run_machine(machine, self.interface, self.channel, find_plant(self.plant, machine))
 
 
 @dataclass(kw_only=True)
-class Drive(Command):
+class DriveMachine(Command):
     """Drive a machine on a CAN bus at its rate; not a safety function, see docs/hardware.md."""
 
     interface: str  # python-can's name of the bus: socketcan, udp_multicast, ...
