@@ -55,7 +55,8 @@ class Nodes:
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}
         self.raw = np.full(machine.n, -1)  # -1: none yet
-        self.frames = np.zeros(machine.n, int)  # positions of this tick; a malformed one counts 2
+        self.early = np.zeros(machine.n, bool)  # did a position come before this tick's SYNC?
+        self.frames = np.zeros(machine.n, int)  # positions since then; a malformed one counts 2
         self.heartbeat = np.full(machine.n + 1, -np.inf)  # s, -inf: never
         self.nmt = np.zeros(machine.n + 1, int)
         self.u: Array = np.zeros(machine.n)  # commands of the newest valve frame

@@ -51,7 +51,8 @@ class GateInputs(NamedTuple):
 
     command: Array  # of the controller [counts of 127], (..., n)
     counts: Counts  # angles [encoder counts], (..., n)
-    frames: Counts  # positions received since the last tick, a malformed one counts 2, (..., n)
+    early: Flag  # did a position come before SYNC? (..., n)
+    frames: Counts  # positions since SYNC, a malformed one counts 2, (..., n)
     heartbeat: Array  # time of each node's last heartbeat [s], -inf: never, (..., n + 1)
     nmt: Counts  # state of each node, (..., n + 1)
     enable: Flag  # is the dead-man switch held?
@@ -162,6 +163,7 @@ def fault_table(
         "heartbeat lost": ~((age >= -machine.dt) & (age <= HEARTBEAT_TIMEOUT)),
         "not operational": inputs.nmt != OPERATIONAL,
         "silent": inputs.frames < 1,
+        "position before SYNC": inputs.early,
         "position doubled, not of 4 bytes, or FFFFFFFF": inputs.frames > 1,
         "out of range": (q < low) | (q > high),
         "jumped": np.abs(q - state.counts * step) > jump,
