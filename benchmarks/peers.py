@@ -31,13 +31,14 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.evaluation.baselines import read_gains
-from brokk_min.evaluation.rollout import Controller, rollout
+from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.learning.checkpoint import Env, stagger_episodes
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170 as M
+from brokk_min.machine import Controller
 from brokk_min.settings import PPOConfig
 
 CHOICES: dict[str, tuple[float, ...]] = {

@@ -26,7 +26,7 @@ COMMANDS: dict[str, Any] = {
     "reproduce": evaluation.Reproduce,
     "sweep": training.Sweep,
     "machine": operating.Simulate,
-    "drive": operating.Drive,
+    "drive": operating.DriveMachine,
     "play": operating.Play,
     "replay": operating.Replay,
     "export": operating.Export,

@@ -8,40 +8,39 @@ Nothing here is a safety function: keep the hard-wired emergency stop (docs/hard
 """
 
 import gc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from brokk_min.actuator import append_sample, initial_history
 from brokk_min.can import canopen
-from brokk_min.can.canopen import Array, Operator, OperatorInput
+from brokk_min.can.canopen import Counts, Operator, OperatorInput
 from brokk_min.can.connection import Bus, stop_signals
 from brokk_min.can.safety_gate import GateInputs, gate, gate_start
 from brokk_min.env import measure
-from brokk_min.machine import PWM_MAX, Machine, Measured
+from brokk_min.machine import PWM_MAX, Array, Controller, Machine, Measured
 
 ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
 
 
 class Drive:
-    """From the operator's velocity goals, through a controller and the gate, to the valves.
-
-    `controller` is a policy or a baseline, with `start` and a call as `JacobianController` has.
-    """
+    """From the operator's velocity goals, through a controller and the gate, to the valves."""
 
     controller_state: Any  # from the first tick with all positions on
     start_time: float  # s, see `begin`
     lateness: float  # s, of the last tick
 
-    def __init__(self, machine: Machine, controller: Any, bus: Bus, operator: Operator) -> None:
+    def __init__(
+        self, machine: Machine, controller: Controller, bus: Bus, operator: Operator
+    ) -> None:
         self.machine, self.controller = machine, controller
         self.bus, self.operator = bus, operator
         self.operator_input = OperatorInput()
         self.nodes = canopen.Nodes(machine)
         self.gate = gate_start(machine)
         self.history: Array | None = None  # None after a gap
+        self.measured: Measured | None = None  # newest, arrays (1, ...); None after a gap
         self.exception = ""  # of this tick
         self.last_exception = ""  # since it drove
         self.signals: list[int] = []
@@ -69,56 +68,68 @@ class Drive:
             gc.enable()
 
     def tick(self) -> bool:
-        """Wait for the deadline, then one tick; False if it was the last."""
+        """Wait, then operator, SYNC and positions, control, gate, frame; False: it was the last."""
         self.wait()
-        with self.catch_errors():
-            ready = not str(self.gate.active_fault)
-            self.operator_input = self.operator(bool(self.gate.driving), ready)
-        self.nodes.frames *= 2  # 1 is sound: a position that came before SYNC becomes 2, a fault
-        with self.catch_errors():
-            self.bus.send(canopen.SYNC, b"")
-            answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
-            self.nodes.listen(self.bus, answer_by, until_complete=True)
+        self.attempt(self.ask_operator)
+        self.attempt(self.ask_positions)
         counts = canopen.encoder_counts(self.machine, self.nodes.raw)
-        command = np.zeros(self.machine.n)
-        with self.catch_errors():
-            command = self.control(counts)
+        command = self.attempt(self.control, counts, default=np.zeros(self.machine.n))
         stop = self.operator_input.stop or bool(self.signals)
         self.operator_input = self.operator_input._replace(stop=stop)
-        with self.catch_errors():
-            self.bus.log_input(self.operator_input.pack())
+        self.attempt(lambda: self.bus.log_input(self.operator_input.pack()))
         self.send_command(command, counts)
         self.nodes.start_tick()
-        with self.catch_errors():
-            released = not (self.operator_input.enable or self.gate.driving)
-            if released and (self.nodes.nmt != canopen.OPERATIONAL).any():
-                self.bus.send(canopen.NMT, canopen.START_ALL)  # nodes that fell back
-            self.bus.flush()
-        return not self.operator_input.stop
+        self.attempt(self.restart_nodes)
+        self.attempt(self.bus.flush)
+        return not stop
 
-    def control(self, counts: Array) -> Array:
+    def attempt(self, action: Callable[..., Any], *arguments: Any, default: Any = None) -> Any:
+        """What the action returns; an exception becomes a fault of the gate, and `default`."""
+        try:
+            return action(*arguments)
+        except Exception as error:
+            self.exception = f"{type(error).__name__}: {error}"
+            return default
+
+    def ask_operator(self) -> None:
+        """Take the operator's input, which stays what it was if this raises."""
+        ready = not str(self.gate.active_fault)
+        self.operator_input = self.operator(bool(self.gate.driving), ready)
+
+    def ask_positions(self) -> None:
+        """Send SYNC, and listen until all encoders have answered or their time is over."""
+        self.nodes.early = self.nodes.frames > 0  # no answers to this SYNC
+        self.nodes.frames[:] = 0
+        self.bus.send(canopen.SYNC, b"")
+        answer_by = self.bus.now() + ANSWER_TIME * self.machine.dt
+        self.nodes.listen(self.bus, answer_by, until_complete=True)
+
+    def control(self, counts: Counts) -> Array:
         """The controller's command [counts of 127] (n,) at angles `counts` [encoder counts]."""
         m = self.machine
-        if (self.nodes.frames != 1).any():
-            self.history = None  # samples before a gap do not join those after it
+        if (self.nodes.early | (self.nodes.frames != 1)).any():
+            self.history = self.measured = None  # samples before a gap do not join those after it
             return np.zeros(m.n)
         q = (counts[None] * m.encoder_step).astype(np.float32)  # as `machine.read_encoder`
         if self.history is None:
             self.history = initial_history(q, m.history)
         else:
-            u = self.gate.sent[..., -1] / PWM_MAX  # what the gate let pass
-            self.history = append_sample(self.history, u, q, m.velocity_samples, m.dt)
+            sent = self.gate.sent[..., -1] / PWM_MAX  # what the gate let pass
+            self.history = append_sample(self.history, sent, q, m.velocity_samples, m.dt)
         if not self.gate.driving:
             self.controller_state = self.controller.start(1)
+        v_goal = np.array([self.operator_input.v_goal], np.float32)
+        self.measured = measure(m, self.history, v_goal)
         u, self.controller_state = self.controller(self.measured, self.controller_state)
         return np.asarray(np.rint(u[0] * PWM_MAX), float)
 
-    def send_command(self, command: Array, counts: Array) -> None:
+    def send_command(self, command: Array, counts: Counts) -> None:
         """Pass the safety gate, and send the valve frame once the gate was armed."""
         entered = self.operator_input
         inputs = GateInputs(
             command=command,
             counts=counts,
+            early=self.nodes.early,
             frames=self.nodes.frames,
             heartbeat=self.nodes.heartbeat,
             nmt=self.nodes.nmt,
@@ -133,9 +144,14 @@ class Drive:
         self.gate, frame = gate(self.machine, self.gate, inputs, self.bus.now())
         self.last_exception = "" if self.gate.driving else self.exception or self.last_exception
         self.exception = ""  # one while sending is a fault of the next tick
-        with self.catch_errors():
-            if self.gate.armed_once:
-                self.bus.send(self.machine.valve_frame_id, frame.tobytes())
+        if self.gate.armed_once:
+            self.attempt(self.bus.send, self.machine.valve_frame_id, frame.tobytes())
+
+    def restart_nodes(self) -> None:
+        """Start the nodes that fell back, once the switch is released."""
+        released = not (self.operator_input.enable or self.gate.driving)
+        if released and (self.nodes.nmt != canopen.OPERATIONAL).any():
+            self.bus.send(canopen.NMT, canopen.START_ALL)
 
     @property
     def reason(self) -> str:
@@ -147,28 +163,11 @@ class Drive:
     def wait(self) -> None:
         """Listen until the deadline, then set the next one, which is in the future."""
         deadline = self.start_time + self.deadline_number * self.machine.dt  # no sum: no drift
-        with self.catch_errors():
-            self.nodes.listen(self.bus, deadline)
+        self.attempt(self.nodes.listen, self.bus, deadline)
         self.bus.sleep(max(0.0, deadline - self.bus.now()))  # a broken bus does not wait
         self.lateness = self.bus.now() - deadline
         missed = max(0, int(self.lateness // self.machine.dt))
         if missed:
-            self.history = None  # its samples must be a tick apart
+            self.history = self.measured = None  # its samples must be a tick apart
         self.deadline_number += 1 + missed
         self.ticks += 1
-
-    @contextmanager
-    def catch_errors(self) -> Iterator[None]:
-        """An exception inside becomes a fault of the gate."""
-        try:
-            yield
-        except Exception as error:
-            self.exception = f"{type(error).__name__}: {error}"
-
-    @property
-    def measured(self) -> Measured | None:
-        """Newest measurements of the machine, arrays (1, ...); None after a gap."""
-        if self.history is None:
-            return None
-        v_goal = np.array([self.operator_input.v_goal], np.float32)
-        return measure(self.machine, self.history, v_goal)

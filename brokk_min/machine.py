@@ -6,7 +6,7 @@ To port the project means to write another `Machine`; nothing else knows a Brokk
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -177,6 +177,16 @@ class Measured(NamedTuple):
     q: Array  # newest angles [rad], (..., n)
     q_dot: Array  # newest velocities of the driven joints [rad/s], (..., n_driven)
     history: Array  # angles, velocities, commands of the driven joints, (..., n_driven, 3, H)
+
+
+class Controller(Protocol):
+    """What can drive a machine: a policy, the PIDs, an operator."""
+
+    def start(self, num: int) -> Any:
+        """State of `num` controllers at rest."""
+
+    def __call__(self, measured: Measured, state: Any, /) -> tuple[Array, Any]:
+        """Commands u [-1, 1] (num, n), and the controllers' state of the next tick."""
 
 
 def by_direction(u: Array, pairs: ArrayLike) -> Array:

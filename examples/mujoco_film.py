@@ -20,8 +20,8 @@ try:
 except Exception as error:  # of PyOpenGL, if MUJOCO_GL names a library that is not there
     raise SystemExit(f"MUJOCO_GL: expected an OpenGL library that is there, got {error}") from None
 
+from brokk_min.can.operator_input import read_commands
 from brokk_min.evaluation.rollout import rollout
-from brokk_min.evaluation.sequences import read_commands
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.settings import TaskConfig
@@ -61,7 +61,7 @@ def main(options: Options) -> None:
     camera.lookat[:], camera.distance = (0.0, 1.5, 0.9), 6.5
     camera.azimuth, camera.elevation = 155.0, -12.0
     controller = load_policy(options.policy, M)
-    goals = read_commands(options.commands, M)[0].goals[:, None]
+    goals = next(iter(read_commands(options.commands, M).values()))[:, None]
     rng = np.random.default_rng(options.seed)
     trace = rollout(M, controller, [M.q_start], goals, TaskConfig.noise, rng, PLANT)
     step = max(1, round(M.rate / options.fps))

@@ -52,6 +52,7 @@ def case(enable: bool, centred: bool, stop: bool, q: np.ndarray, command: int) -
     return GateInputs(
         command=np.full(n, command) * np.isin(np.arange(n), BROKK_170.driven),
         counts=np.rint(q / BROKK_170.encoder_step).astype(int),
+        early=np.zeros(n, bool),
         frames=np.ones(n, int),
         heartbeat=np.ones(n + 1),
         nmt=np.full(n + 1, OPERATIONAL),

@@ -114,7 +114,7 @@ SEND_ERROR = raises(can.CanOperationError("no buffer space"))
 THEIRS = valve_frame([77, 0, 0, 0, 0], 0, 1).tobytes()
 OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
 NOT_OPERATIONAL = "valve controller: not operational"
-DOUBLED = "position doubled, not of 4 bytes"
+EARLY, DOUBLED = "position before SYNC", "position doubled, not of 4 bytes"
 FAULTS = {
     "valve controller silent": (up(0x710, lambda d: []), "valve controller: heartbeat lost"),
     "valve controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
@@ -147,7 +147,8 @@ for node in range(1, 6):
         "jumps": (up(tpdo, moved(90)), "jumped"),
         "jumps by half a turn": (up(tpdo, moved(2048)), "out of range"),
         "says FFFFFFFF": (up(tpdo, lambda d: [b"\xff" * 4]), DOUBLED),
-        "doubled": (up(tpdo, lambda d: [d, d]), DOUBLED),
+        # the last answer ends the wait: its double comes before the next SYNC
+        "doubled": (up(tpdo, lambda d: [d, d]), EARLY if node == 5 else DOUBLED),
         "malformed": (up(tpdo, lambda d: [d[:3]]), DOUBLED),
         "heartbeat lost": (up(heartbeat, lambda d: []), "heartbeat lost"),
         "rebooted": (up(heartbeat, lambda d: [b"\x00"]), "not operational"),
@@ -157,7 +158,7 @@ for node in range(1, 6):
     for name, (cause, words) in of_joint.items():
         FAULTS[f"q{node} {name}"] = (cause, f"q{node}: {words}")
 cause = partial(foreign, can_id=0x185, data=bytes(4))
-FAULTS["position of q5 before SYNC as well"] = (cause, f"q5: {DOUBLED}")
+FAULTS["position of q5 before SYNC as well"] = (cause, f"q5: {EARLY}")
 NOT_FOUND = {
     "q2 frozen, the locked joint": (partial(freeze, node=2), "it may stand still"),
     "q3 a tick late, without a gap": (partial(repeat_once, node=3), "no time, no number"),

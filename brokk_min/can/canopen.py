@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import PWM_MAX, Machine, decode_pwm, encode_pwm, require
+from brokk_min.machine import PWM_MAX, Array, Machine, decode_pwm, encode_pwm, require
 
-Array = NDArray[Any]  # counts and flags, too
+Counts = NDArray[np.integer[Any]]  # whole numbers, such as bytes
 
 # CAN identifiers of CANopen; from TPDO1 on the node's number is added
 NMT = 0x000
@@ -55,7 +55,8 @@ class Nodes:
         self.position_index = {TPDO1 + node: i for i, node in enumerate(nodes[:-1])}
         self.heartbeat_index = {HEARTBEAT + node: i for i, node in enumerate(nodes)}
         self.raw = np.full(machine.n, -1)  # -1: none yet
-        self.frames = np.zeros(machine.n, int)  # positions of this tick; a malformed one counts 2
+        self.early = np.zeros(machine.n, bool)  # did a position come before this tick's SYNC?
+        self.frames = np.zeros(machine.n, int)  # positions since then; a malformed one counts 2
         self.heartbeat = np.full(machine.n + 1, -np.inf)  # s, -inf: never
         self.nmt = np.zeros(machine.n + 1, int)
         self.u: Array = np.zeros(machine.n)  # commands of the newest valve frame
@@ -162,7 +163,7 @@ def sdo(bus: Any, node: int, address: tuple[int, int], data: bytes = b"") -> int
     raise ValueError(f"{what}: expected an answer within {SDO_TIMEOUT} s, got none")
 
 
-def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
+def encoder_counts(machine: Machine, raw: ArrayLike) -> Counts:
     """Joint angles [counts] of raw positions (..., n): zeroed, unwrapped at mid range."""
     turn = 2**machine.encoder_bits
     zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
@@ -172,13 +173,13 @@ def encoder_counts(machine: Machine, raw: ArrayLike) -> Array:
     return np.asarray((counts - lowest) % turn + lowest)
 
 
-def encoder_raw(machine: Machine, counts: ArrayLike) -> Array:
+def encoder_raw(machine: Machine, counts: ArrayLike) -> Counts:
     """Raw positions of encoders with 26 bits at joint angles [counts] (..., n)."""
     zero, sign = (machine.column(name).astype(int) for name in ("encoder_zero", "encoder_sign"))
     return np.asarray((sign * np.asarray(counts) + zero) % 2**POSITION_BITS)
 
 
-def checksum(frame: ArrayLike) -> Array:
+def checksum(frame: ArrayLike) -> Counts:
     """CRC-8 SAE J1850 of bytes (..., k), (...): polynomial 0x1D, start and final XOR 0xFF."""
     crc = np.array(0xFF)
     for byte in np.moveaxis(np.asarray(frame, int), -1, 0):
@@ -188,7 +189,7 @@ def checksum(frame: ArrayLike) -> Array:
     return crc ^ 0xFF
 
 
-def valve_frame(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Array:
+def valve_frame(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Counts:
     """Bytes (..., 8): five PWM bytes, counter, checksum, enable.
 
     `command` [counts of 127] is (..., n) with n at most 5. Paper: Sec. 3.2 (PWM bytes)

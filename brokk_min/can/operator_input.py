@@ -3,16 +3,39 @@
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min._files import require_package
+from brokk_min._files import brief, numbers, read_csv, require_package
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.machine import PWM_MAX, Array, Machine, Measured, require
 
 PATIENCE = 5.0  # s that a script waits until the machine is ready
+
+
+def read_commands(path: Path, machine: Machine) -> dict[str, Array]:
+    """Goals (T, 3) [m/s] of each sequence of a CSV `sequence,time,vx,vy,vz` [s, m/s], by its name.
+
+    Values hold until the next row; the last row of a sequence is its end. ValueError: no such
+    table, or rows below a tick apart.
+    """
+    names = ("time", "vx", "vy", "vz")
+    table = read_csv(path, "sequence", *names)
+    columns = np.stack([numbers(path, name, table[name]) for name in names], axis=1)
+    goals = {}
+    for name in dict.fromkeys(table["sequence"].tolist()):
+        rows = columns[table["sequence"] == name]
+        time, velocity = rows[:, 0] - rows[0, 0], rows[:, 1:]
+        fits = len(time) > 1 and (np.diff(time) > 0.99 * machine.dt).all() and np.isfinite(rows)
+        wanted = "two or more rows of finite numbers, each a tick or more after the one before"
+        require(bool(np.all(fits)), f"{path}: sequence {name}", wanted, brief(time.tolist()))
+        tick = np.arange(round(time[-1] * machine.rate))
+        row = np.searchsorted(time, tick / machine.rate + 1e-6, "right") - 1
+        goals[name] = velocity[row]
+    return goals
 
 
 class Script:

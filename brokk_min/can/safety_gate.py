@@ -7,10 +7,13 @@ function: a real machine keeps its hard-wired emergency stop (docs/hardware.md).
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.can.canopen import OPERATIONAL, Array, valve_frame
-from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.can.canopen import OPERATIONAL, Counts, valve_frame
+from brokk_min.machine import PWM_MAX, Array, Machine
+
+Flag = NDArray[np.bool_]
+Words = NDArray[np.str_]
 
 # all assumed
 HEARTBEAT_TIMEOUT = 0.110  # s
@@ -30,34 +33,35 @@ SLOWEST = 0.4  # of the fastest motion: long lever arm, weak pump
 class GateState(NamedTuple):
     """What the gate remembers, with the values of its start; arrays (...) unless noted."""
 
-    counts: Array  # newest angles [encoder counts], (..., n)
+    counts: Counts  # newest angles [encoder counts], (..., n)
     sent: Array  # commands of `OPENING_TIME`, newest last [counts of 127], (..., n, ticks)
-    place: Array  # counts that the encoder has stayed at, (..., n)
+    place: Counts  # counts that the encoder has stayed at, (..., n)
     motion: Array  # of the joint since it came there, at least [rad], (..., n)
-    driving: Array = np.array(False)  # may the valves move?
-    armed_once: Array = np.array(False)  # before, nothing is sent
-    active_fault: Array = np.array("switched on")  # words of this tick's; empty: ready
-    latched_fault: Array = np.array("")  # words of what stopped it, until it is armed again
-    enable: Array = np.array(True)  # dead-man switch at the last tick with device, without error
+    driving: Flag = np.array(False)  # may the valves move?
+    armed_once: Flag = np.array(False)  # before, nothing is sent
+    active_fault: Words = np.array("switched on")  # words of this tick's; empty: ready
+    latched_fault: Words = np.array("")  # words of what stopped it, until it is armed again
+    enable: Flag = np.array(True)  # dead-man switch at the last tick with device, without error
     time: Array = np.array(-np.inf)  # s, of the last tick
-    counter: Array = np.array(0)  # of the last valve frame
+    counter: Counts = np.array(0)  # of the last valve frame
 
 
 class GateInputs(NamedTuple):
     """Inputs of one tick; the last node is the valve controller. Arrays (...) unless noted."""
 
     command: Array  # of the controller [counts of 127], (..., n)
-    counts: Array  # angles [encoder counts], (..., n)
-    frames: Array  # positions received since the last tick, a malformed one counts 2, (..., n)
+    counts: Counts  # angles [encoder counts], (..., n)
+    early: Flag  # did a position come before SYNC? (..., n)
+    frames: Counts  # positions since SYNC, a malformed one counts 2, (..., n)
     heartbeat: Array  # time of each node's last heartbeat [s], -inf: never, (..., n + 1)
-    nmt: Array  # state of each node, (..., n + 1)
-    enable: Array  # is the dead-man switch held?
-    centred: Array  # is the goal zero?
-    alive: Array  # is the operator's device there?
-    stop: Array  # must the program end?
-    error: Array  # was an exception raised?
-    flooded: Array  # more frames in the tick than the loop reads?
-    other_sender: Array  # SYNC, NMT or valve frames that the loop did not send?
+    nmt: Counts  # state of each node, (..., n + 1)
+    enable: Flag  # is the dead-man switch held?
+    centred: Flag  # is the goal zero?
+    alive: Flag  # is the operator's device there?
+    stop: Flag  # must the program end?
+    error: Flag  # was an exception raised?
+    flooded: Flag  # more frames in the tick than the loop reads?
+    other_sender: Flag  # SYNC, NMT or valve frames that the loop did not send?
 
 
 def gate_start(machine: Machine) -> GateState:
@@ -69,7 +73,7 @@ def gate_start(machine: Machine) -> GateState:
 
 def gate(
     machine: Machine, state: GateState, inputs: GateInputs, now: ArrayLike
-) -> tuple[GateState, Array]:
+) -> tuple[GateState, Counts]:
     """Next state, and the valve frame (..., 8) to send if it was `armed_once`. Paper: Sec. 2
 
     A rising edge of the dead-man switch at zero goal, without any fault, arms the gate. Any fault,
@@ -113,7 +117,7 @@ def limit_slew(machine: Machine, state: GateState, inputs: GateInputs) -> Array:
     return np.minimum(np.maximum(inputs.command, lowest), highest)
 
 
-def expected_motion(machine: Machine, state: GateState, counts: Array) -> tuple[Array, Array]:
+def expected_motion(machine: Machine, state: GateState, counts: Counts) -> tuple[Counts, Array]:
     """`place` and `motion` [rad] of the next state, (..., n).
 
     Once all commands of `OPENING_TIME` went to one side beyond the largest dead zone, the joint
@@ -138,7 +142,7 @@ def still_counts(machine: Machine) -> Array:
 
 def fault_table(
     machine: Machine, state: GateState, inputs: GateInputs, motion: Array, now: Array
-) -> dict[str, Array]:
+) -> dict[str, Flag]:
     """What can be wrong: of the program (...), of joints (..., n), of all nodes (..., n + 1)."""
     step = machine.encoder_step
     q = inputs.counts * step
@@ -159,6 +163,7 @@ def fault_table(
         "heartbeat lost": ~((age >= -machine.dt) & (age <= HEARTBEAT_TIMEOUT)),
         "not operational": inputs.nmt != OPERATIONAL,
         "silent": inputs.frames < 1,
+        "position before SYNC": inputs.early,
         "position doubled, not of 4 bytes, or FFFFFFFF": inputs.frames > 1,
         "out of range": (q < low) | (q > high),
         "jumped": np.abs(q - state.counts * step) > jump,
@@ -168,10 +173,10 @@ def fault_table(
     }
 
 
-def first_fault(machine: Machine, faults: dict[str, Array]) -> Array:
+def first_fault(machine: Machine, faults: dict[str, Flag]) -> Words:
     """Words (...) of the first fault in the table, and its first node; empty for no fault."""
     nodes = np.array([*machine.names, "valve controller"])
-    words: Array = np.array("")
+    words: Words = np.array("")
     for text, found in reversed(faults.items()):
         if found.ndim == faults["error"].ndim:  # of the program, not of nodes
             words = np.where(found, text, words)

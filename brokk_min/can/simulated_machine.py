@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.can import canopen
-from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Array, Frame, checksum
+from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Frame, checksum
 from brokk_min.can.connection import open_bus, stop_signals
-from brokk_min.machine import Machine
+from brokk_min.machine import Array, Machine
 
 STEP = 0.005  # s, of the plant
 PRE_OPERATIONAL = 127  # NMT state after each NMT command but the start
-Frames = list[tuple[int, bytes]]  # identifiers and data
+Outgoing = list[tuple[int, bytes]]  # identifiers and data
 
 
 class SimulatedMachine:
@@ -48,9 +48,9 @@ class SimulatedMachine:
         """Time of the next plant step [s]."""
         return self.start + (self.steps + 1) * STEP
 
-    def advance(self, now: float) -> Frames:
+    def advance(self, now: float) -> Outgoing:
         """Move plant, watchdog and heartbeats on to `now` [s]; frames to send."""
-        out: Frames = []
+        out: Outgoing = []
         while (then := self.next_step) <= now:
             if self.enabled and then - self.valid >= WATCHDOG:
                 self._trip(f"no valve frame for {WATCHDOG} s")
@@ -61,7 +61,7 @@ class SimulatedMachine:
                 out += [(canopen.HEARTBEAT + node, bytes([x])) for node, x in self.nmt.items()]
         return out
 
-    def receive(self, frame: Frame) -> Frames:
+    def receive(self, frame: Frame) -> Outgoing:
         """Take in one frame; frames to answer with."""
         node = frame.id - canopen.SDO_REQUEST
         if frame.id == canopen.SYNC:
@@ -77,7 +77,7 @@ class SimulatedMachine:
             return [(canopen.SDO_ANSWER + node, self._on_sdo(node, frame.data))]
         return []
 
-    def _positions(self) -> Frames:
+    def _positions(self) -> Outgoing:
         counts = np.rint(np.asarray(self.state.q) / self.machine.encoder_step).astype(int)
         raw = zip(self.encoders, canopen.encoder_raw(self.machine, counts).astype("<u4"))
         return [(canopen.TPDO1 + i, x.tobytes()) for i, x in raw if self.nmt[i] == OPERATIONAL]
@@ -125,7 +125,7 @@ def start_pose(machine: Machine) -> Array:
     return (machine.column("q_min") + machine.column("q_max")) / 2
 
 
-def simulate(machine: Machine, interface: str, channel: str, plant: Plant = PLANT) -> None:
+def run_machine(machine: Machine, interface: str, channel: str, plant: Plant = PLANT) -> None:
     """Run a simulated machine on a bus until a signal; it prints why its valve controller stops."""
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:

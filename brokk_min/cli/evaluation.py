@@ -7,12 +7,13 @@ from pathlib import Path
 
 from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet, Plant
+from brokk_min.can.operator_input import read_commands
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation import baselines, metrics, sequences
-from brokk_min.evaluation.rollout import TITLES, Controller, valves_at_rest
+from brokk_min.evaluation.rollout import TITLES, valves_at_rest
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.policy import POLICIES, load_policy
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Controller, Machine
 
 
 @dataclass(kw_only=True)
@@ -52,7 +53,8 @@ class Evaluate(Command):
     def task(self, machine: Machine) -> tuple[list[sequences.Commands], Array]:
         """Velocity sequences and start poses of files, or the machine's own."""
         own = sequences.task_sequences(machine)
-        commands = sequences.read_commands(self.commands, machine) if self.commands else own
+        given = read_commands(self.commands, machine) if self.commands else {}
+        commands = [sequences.Commands(name, goals) for name, goals in given.items()] or own
         if self.starts:
             return commands, sequences.read_starts(self.starts, machine)
         starts = sequences.evaluation_starts(machine, self.num_starts, own, self.seed + 2)

@@ -11,15 +11,14 @@ from tyro.conf import Positional
 
 from brokk_min import hw
 from brokk_min.can.connection import open_bus
-from brokk_min.can.operator_input import JointJog, Joystick, Script
-from brokk_min.can.shadow import Shadow
-from brokk_min.can.simulated_machine import simulate
+from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
+from brokk_min.can.simulated_machine import run_machine
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
-from brokk_min.evaluation.rollout import TITLES, Controller
-from brokk_min.evaluation.sequences import read_commands
+from brokk_min.evaluation.rollout import TITLES
 from brokk_min.learning.policy import load_policy
-from brokk_min.machine import PWM_MAX, Machine, require
+from brokk_min.machine import PWM_MAX, Controller, Machine, require
+from brokk_min.shadow import Shadow
 
 
 @dataclass(kw_only=True)
@@ -32,11 +31,11 @@ class Simulate(Command):
 
     def __call__(self, machine: Machine) -> None:
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
-        simulate(machine, self.interface, self.channel, find_plant(self.plant, machine))
+        run_machine(machine, self.interface, self.channel, find_plant(self.plant, machine))
 
 
 @dataclass(kw_only=True)
-class Drive(Command):
+class DriveMachine(Command):
     """Drive a machine on a CAN bus at its rate; not a safety function, see docs/hardware.md."""
 
     interface: str  # python-can's name of the bus: socketcan, udp_multicast, ...
@@ -84,8 +83,8 @@ class Drive(Command):
             return None
         if self.command in ("", "joystick"):
             return Joystick(machine, self.axes, self.button)
-        goals = [sequence.goals for sequence in read_commands(Path(self.command), machine)]
-        return Script(machine, np.concatenate(goals))
+        goals = read_commands(Path(self.command), machine)
+        return Script(machine, np.concatenate([*goals.values()]))
 
 
 def find_controller(machine: Machine, policy: Path | None, rl: bool) -> Controller:

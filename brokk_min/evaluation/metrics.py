@@ -11,10 +11,10 @@ from tqdm import tqdm
 from brokk_min import __version__
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import reward
-from brokk_min.evaluation.rollout import Controller, Trace, rollout
+from brokk_min.evaluation.rollout import Trace, rollout
 from brokk_min.evaluation.sequences import Commands
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Controller, Machine
 from brokk_min.settings import TaskConfig
 
 Controllers = Mapping[str, Controller]  # by name

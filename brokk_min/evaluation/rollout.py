@@ -1,6 +1,6 @@
 """A controller follows given tool velocities, on the analytic plant or on any other one."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import draw_noise, initial_state, measure, transition
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
-from brokk_min.machine import Array, Machine, Measured
+from brokk_min.machine import Array, Controller, Machine
 from brokk_min.settings import TaskConfig
 
 TITLES = {  # of controllers in tables, figures and windows, by their names in files
@@ -25,16 +25,6 @@ TITLES = {  # of controllers in tables, figures and windows, by their names in f
 def valves_at_rest(name: str) -> str:
     """The class of a controller: "closed" valves while the tool rests, or "open" ones."""
     return "closed" if name in ("rl", "jacobian_pid_ff_integral") else "open"
-
-
-class Controller(Protocol):
-    """What can drive a machine: a policy, the PIDs, an operator."""
-
-    def start(self, num: int) -> Any:
-        """State of `num` controllers at rest."""
-
-    def __call__(self, measured: Measured, state: Any, /) -> tuple[Array, Any]:
-        """Commands u [-1, 1] (num, n), and the controllers' state of the next tick."""
 
 
 class Trace(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min._files import SHIPPED, brief, numbers, read_csv
+from brokk_min._files import SHIPPED, numbers, read_csv
 from brokk_min.actuator import cylinder_speeds, lever_arm
 from brokk_min.env import draw_goal, draw_hold, draw_pose
 from brokk_min.jacobian import dls, limit_weights
@@ -102,27 +102,6 @@ def _with_rests(rows: Array, rng: np.random.Generator) -> Array:
 def _log_uniform(rng: np.random.Generator, num: int) -> Array:
     """Random lengths of rests [s], (num,)."""
     return np.exp(rng.uniform(np.log(SHORTEST_REST), np.log(LONGEST_REST), num))
-
-
-def read_commands(path: Path, machine: Machine) -> list[Commands]:
-    """Sequences of a CSV `sequence,time,vx,vy,vz` [s, m/s]; values hold until the next row.
-
-    The last row of a sequence is its end. ValueError: no such table, or rows below a tick apart.
-    """
-    names = ("time", "vx", "vy", "vz")
-    table = read_csv(path, "sequence", *names)
-    columns = np.stack([numbers(path, name, table[name]) for name in names], axis=1)
-    result = []
-    for name in dict.fromkeys(table["sequence"].tolist()):
-        rows = columns[table["sequence"] == name]
-        time, velocity = rows[:, 0] - rows[0, 0], rows[:, 1:]
-        fits = len(time) > 1 and (np.diff(time) > 0.99 * machine.dt).all() and np.isfinite(rows)
-        wanted = "two or more rows of finite numbers, each a tick or more after the one before"
-        require(bool(np.all(fits)), f"{path}: sequence {name}", wanted, brief(time.tolist()))
-        tick = np.arange(round(time[-1] * machine.rate))
-        row = np.searchsorted(time, tick / machine.rate + 1e-6, "right") - 1
-        result.append(Commands(name, velocity[row]))
-    return result
 
 
 def read_starts(path: Path, machine: Machine) -> Array:

@@ -13,22 +13,21 @@ from brokk_min.actuator import PLANT, Plant
 from brokk_min.can.operator_input import shape_axis
 from brokk_min.can.simulated_machine import start_pose
 from brokk_min.env import initial_state, measure, transition
-from brokk_min.evaluation.rollout import Controller
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Controller, Machine
 from brokk_min.viewer.drawing import Scene, draw
 
-SIZE = (1120, 680)  # px, of the window
+WINDOW = (1120, 680)  # px, of the window
 TRAIL = 600  # positions of the tool that are shown
 # keys for and against x, y and z, as the top view shows them, and axes of a gamepad for them
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
-AXES = (1, 0, 3)
+PAD_AXES = (1, 0, 3)
 UNSEEN = "SDL_VIDEODRIVER=dummy draws unseen"
 HELP = "arrows, W, S: move    left SHIFT: slowly    TAB: the other controller    ESC: end"
 
 
-class Operator:
-    """Keyboard, and a gamepad that SDL knows, as one operator."""
+class Keyboard:
+    """The keyboard, and a gamepad that SDL knows, as one device."""
 
     def __init__(self, machine: Machine, pygame: Any) -> None:
         self.machine, self.pygame = machine, pygame
@@ -50,7 +49,7 @@ class Operator:
         keys = [float(pressed[code(p)]) - float(pressed[code(m)]) for p, m in KEYS]
         target = np.array(keys) / (3 if pressed[code("left shift")] else 1)
         if self.pad is not None:
-            target -= shape_axis([self.pad.get_axis(i) / 32767 for i in AXES])
+            target -= shape_axis([self.pad.get_axis(i) / 32767 for i in PAD_AXES])
         length = max(1.0, float(np.linalg.norm(target)))
         return np.asarray(self.machine.tool_speed * target / length)
 
@@ -86,17 +85,17 @@ def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PL
     pygame = require_package("pygame", "play")
     try:
         window, clock = open_window(pygame), pygame.time.Clock()
-        session, operator = Session(machine, controllers, plant), Operator(machine, pygame)
+        session, keyboard = Session(machine, controllers, plant), Keyboard(machine, pygame)
         while True:
             for event in pygame.event.get():
-                key = operator.handle(event)
+                key = keyboard.handle(event)
                 if key == "escape":
                     return
                 if key == "tab":
                     session.switch()
-            scene = session.tick(operator.velocity())
-            pixels = draw(machine, scene, SIZE).tobytes()
-            window.blit(pygame.image.frombytes(pixels, SIZE, "RGB"), (0, 0))
+            scene = session.tick(keyboard.velocity())
+            pixels = draw(machine, scene, WINDOW).tobytes()
+            window.blit(pygame.image.frombytes(pixels, WINDOW, "RGB"), (0, 0))
             pygame.display.flip()
             clock.tick(machine.rate)
     except pygame.error as error:
@@ -107,7 +106,7 @@ def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PL
 
 def open_window(pygame: Any) -> Any:
     """A new window. Without a display SDL draws unseen: refused unless SDL_VIDEODRIVER is set."""
-    window = pygame.display.set_mode(SIZE)
+    window = pygame.display.set_mode(WINDOW)
     unseen = pygame.display.get_driver() in ("offscreen", "dummy")
     if unseen and "SDL_VIDEODRIVER" not in os.environ:
         raise pygame.error("none")

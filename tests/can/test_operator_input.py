@@ -1,4 +1,4 @@
-"""Script, joystick and joint jog; the joystick is SDL's virtual one."""
+"""Script, its file, joystick and joint jog; the joystick is SDL's virtual one."""
 
 import re
 from types import SimpleNamespace
@@ -9,10 +9,37 @@ import pytest
 from helpers_bus import Virtual
 
 from brokk_min.can.canopen import OperatorInput
-from brokk_min.can.operator_input import JointJog, Joystick, Script, shape_axis
+from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands, shape_axis
 from brokk_min.machine import BROKK_170
 
+HEAD = "sequence,time,vx,vy,vz\n"
 TWO_GOALS = np.array([[0.1, 0, 0], [0, 0.2, 0]])
+
+
+def test_read_commands__holds_values_until_the_next_row(tmp_path):
+    path = tmp_path / "c.csv"
+    rows = "a,5,1,2,3\na,5.1,4,5,6\na,5.15,0,0,0\nb,0,7,8,9\nb,0.05,0,0,0\n"
+    path.write_text(HEAD + rows)
+    goals = read_commands(path, BROKK_170)
+    assert list(goals) == ["a", "b"]
+    assert goals["a"].tolist() == [[1, 2, 3], [1, 2, 3], [4, 5, 6]]
+    assert goals["b"].tolist() == [[7, 8, 9]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("a,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
+        ("a,1,0,0,0\na,1.01,0,0,0\n", "a tick or more .*, got .0.0, 0.01"),
+        ("a,1,0,0,inf\na,2,0,0,0\n", "two or more rows of finite"),
+        ("", "expected rows, got none"),
+    ],
+)
+def test_read_commands__refuses_what_is_no_sequence(tmp_path, rows, message):
+    path = tmp_path / "c.csv"
+    path.write_text(HEAD + rows)
+    with pytest.raises(ValueError, match=f"^{path}: .*{message}"):
+        read_commands(path, BROKK_170)
 
 
 def test_script__waits_presses_plays_and_ends():

@@ -62,6 +62,7 @@ def plain_node(machine, s, i, now, node):
     _, motion = plain_motion(machine, s, i.counts[node], node)
     return faults | {
         "silent": i.frames[node] == 0,
+        "position before SYNC": i.early[node],
         "position doubled, not of 4 bytes, or FFFFFFFF": i.frames[node] >= 2,
         "out of range": not joint.q_min - 0.05 <= q <= joint.q_max + 0.05,
         "jumped": abs(q - before) > jump,
@@ -141,6 +142,7 @@ def draw_inputs(machine, rng):
     return GateInputs(
         command=put(rng, m, 0.01, np.nan, np.inf, -np.inf, 1e300, 81, -81, 80.5, 1, -1),
         counts=np.where(some(rng, 0.3, n), near, middle).astype(int),
+        early=some(rng, 0.005, n),
         frames=put(rng, np.ones((*SHAPE, n), int), 0.01, 0, 2, 3),
         heartbeat=put(rng, beats, 0.01, -0.110, -0.110 - 1e-9, -np.inf, 0.049, 1.0, np.nan),
         nmt=put(rng, np.full((*SHAPE, n + 1), 5), 0.01, 0, 4, 6, 127),
@@ -173,11 +175,11 @@ def draw_state(machine, rng, counts):
         counts=last,
         sent=np.where(some(rng, 0.02, n, 9), -sent, sent),
         place=counts + rng.integers(-2, 3, (*SHAPE, n)),
-        motion=STEP * rng.choice([0.0, 1.5, 2.7, 3.2], (*SHAPE, n), p=[0.7, 0.15, 0.1, 0.05]),
+        motion=STEP * rng.choice([0.0, 1.5, 2.7, 3.2], (*SHAPE, n), p=[0.6, 0.1, 0.1, 0.2]),
     )
 
 
-@pytest.mark.parametrize(("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 1)])
+@pytest.mark.parametrize(("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 2)])
 def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
     rng = np.random.default_rng(seed)
     inputs = draw_inputs(machine, rng)
@@ -196,5 +198,5 @@ def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
         wanted = np.array([getattr(one, name) for one in expected])
         np.testing.assert_array_equal(found, wanted.reshape(*SHAPE, *wanted.shape[1:]), name)
     faults = {one.active_fault.split(": ")[-1] for one in expected}
-    assert len(faults) == 16, "each fault comes up"
+    assert len(faults) == 17, "each fault comes up"
     assert (sent[..., :5].any(axis=-1) & state.driving).sum() > 300

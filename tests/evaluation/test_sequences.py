@@ -74,38 +74,19 @@ def test_task_sequences__by_hand():
         np.testing.assert_allclose(moves[name][: len(rows)], rows, atol=1e-9, err_msg=name)
 
 
-def test_read_commands__holds_values_until_the_next_row(tmp_path):
-    path = tmp_path / "c.csv"
-    rows = "a,5,1,2,3\na,5.1,4,5,6\na,5.15,0,0,0\nb,0,7,8,9\nb,0.05,0,0,0\n"
-    path.write_text(f"sequence,time,vx,vy,vz\n{rows}")
-    first, second = s.read_commands(path, BROKK_170)
-    assert (first.name, second.name) == ("a", "b")
-    assert first.goals.tolist() == [[1, 2, 3], [1, 2, 3], [4, 5, 6]]
-    assert second.goals.tolist() == [[7, 8, 9]]
-
-
 STARTS = "q1,q2,q3,q4,q5\n0,0.5,0.5,1.7,1.2\n"
 OUT_OF_RANGE = r"row 3: expected angles within .*, got \[0.0, 0."
 
 
 @pytest.mark.parametrize(
-    ("read", "rows", "message"),
-    [
-        (s.read_commands, "a,1,0,0,0\na,0,0,0,0\n", "sequence a: expected two or more rows"),
-        (s.read_commands, "a,1,0,0,0\na,1.01,0,0,0\n", "a tick or more .*, got .0.0, 0.01"),
-        (s.read_commands, "a,1,0,0,inf\na,2,0,0,0\n", "two or more rows of finite"),
-        (s.read_commands, "", "expected rows, got none"),
-        (s.read_starts, "0,0.5,0.5,1.7,2.2\n", OUT_OF_RANGE),
-        (s.read_starts, "0,0.5,0.5,nan,1.2\n", OUT_OF_RANGE),
-        (s.read_starts, "0,0,-0.3,2.5,1.2\n", OUT_OF_RANGE),  # in the ground
-    ],
+    "row",
+    ["0,0.5,0.5,1.7,2.2\n", "0,0.5,0.5,nan,1.2\n", "0,0,-0.3,2.5,1.2\n"],  # last: in the ground
 )
-def test_read__refuses_what_is_no_sequence_or_start(tmp_path, read, rows, message):
+def test_read_starts__refuses_what_is_no_start(tmp_path, row):
     path = tmp_path / "c.csv"
-    head = "sequence,time,vx,vy,vz\n" if read == s.read_commands else STARTS
-    path.write_text(head + rows)
-    with pytest.raises(ValueError, match=f"^{path}: .*{message}"):
-        read(path, BROKK_170)
+    path.write_text(STARTS + row)
+    with pytest.raises(ValueError, match=f"^{path}: .*{OUT_OF_RANGE}"):
+        s.read_starts(path, BROKK_170)
 
 
 def test_evaluation_starts__of_the_package_are_those_of_reproduce():

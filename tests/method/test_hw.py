@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from helpers_bus import START, ConstantCommand, HoldingOperator, World, raises, recording
-from helpers_faults import COMMAND, FAULTS, NOT_FOUND, delay, flood, freeze, measure
+from helpers_faults import COMMAND, FAULTS, NOT_FOUND, delay, flood, foreign, freeze, measure
 from helpers_machines import obedient_net, pids
 
 from brokk_min._files import SHIPPED
@@ -190,6 +190,15 @@ def test_tick__finds_positions_later_than_20_ms(low, high, found, world):
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
     assert closes_within(world, begun, 0.175) == bool(found)
+
+
+def test_tick__takes_the_answers_after_a_position_before_sync(world):
+    """It is a fault of one tick; in the next the answers are heard again."""
+    world.run(0.6)
+    foreign(world, 0x185, bytes(4))
+    world.run(0.2)
+    assert world.drive.reason == "fault: q5: position before SYNC"
+    assert world.drive.gate.active_fault == ""
 
 
 def test_tick__leaves_a_fault_by_a_new_edge_only(world):

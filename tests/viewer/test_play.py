@@ -13,7 +13,7 @@ from brokk_min.evaluation.rollout import TITLES
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import play
-from brokk_min.viewer.play import Operator
+from brokk_min.viewer.play import Keyboard
 
 
 @pytest.fixture
@@ -25,22 +25,22 @@ def held(monkeypatch):
 
 
 @pytest.fixture(autouse=True)
-def operator(monkeypatch):
-    """An operator at no display: SDL draws unseen."""
+def keyboard(monkeypatch):
+    """At no display: SDL draws unseen."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setenv("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")  # unseen: never has the focus
     pygame.display.set_mode((10, 10))
     controller.quit()
     pygame.joystick.quit()
     pygame.event.clear()
-    return Operator(BROKK_170, pygame)
+    return Keyboard(BROKK_170, pygame)
 
 
-def velocity(operator):
+def velocity(keyboard):
     """The goal velocity after all events."""
     for event in pygame.event.get():
-        operator.handle(event)
-    return operator.velocity()
+        keyboard.handle(event)
+    return keyboard.velocity()
 
 
 @pytest.mark.parametrize(
@@ -53,21 +53,21 @@ def velocity(operator):
         ("down,left shift", (-0.1, 0, 0)),
     ],
 )
-def test_velocity__is_that_of_the_keys_and_at_most_the_tool_speed(operator, held, keys, goal):
+def test_velocity__is_that_of_the_keys_and_at_most_the_tool_speed(keyboard, held, keys, goal):
     held.update(keys.split(","))
-    np.testing.assert_allclose(operator.velocity(), goal, atol=1e-12)
+    np.testing.assert_allclose(keyboard.velocity(), goal, atol=1e-12)
 
 
-def test_gamepad__drives_until_it_is_unplugged(operator):
+def test_gamepad__drives_until_it_is_unplugged(keyboard):
     """A trigger at its end moves nothing."""
     device = Virtual(buttons=15, kind=1)
-    assert not velocity(operator).any()
+    assert not velocity(keyboard).any()
     for axis, value in ((1, -1.0), (3, 1.0), (4, -1.0)):  # forward, down, a trigger
         device.axis(axis, value)
     expected = 0.3 * np.array([1, 0, -1]) / 2**0.5
-    np.testing.assert_allclose(velocity(operator), expected, atol=1e-6)
+    np.testing.assert_allclose(velocity(keyboard), expected, atol=1e-6)
     device.unplug()
-    assert not velocity(operator).any()
+    assert not velocity(keyboard).any()
 
 
 def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch, held):

@@ -12,10 +12,10 @@ from helpers_cli import run
 from brokk_min._files import SHIPPED
 from brokk_min.can.canopen import Frame, valve_frame
 from brokk_min.can.drive_log import log_for_fit, read_frames
-from brokk_min.can.shadow import Shadow
 from brokk_min.cli.operating import status
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
+from brokk_min.shadow import Shadow
 
 POLICY = load_policy(SHIPPED / BROKK_170.name / POLICIES["rl"], BROKK_170)
 Q4 = 3

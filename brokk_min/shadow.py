@@ -6,15 +6,14 @@ velocity that the tool has: a controller that fits the machine then asks for the
 """
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
 
 from brokk_min import hw
 from brokk_min.can import canopen
-from brokk_min.can.canopen import Array, Operator, OperatorInput
+from brokk_min.can.canopen import Counts, Operator, OperatorInput
 from brokk_min.can.connection import Bus
-from brokk_min.machine import PWM_MAX, Machine
+from brokk_min.machine import PWM_MAX, Array, Controller, Machine
 
 EARLY = 0.15  # of a tick, by which positions may come early (assumed)
 
@@ -23,7 +22,12 @@ class Shadow(hw.Drive):
     """A `Drive` that sends nothing, or with `sync` SYNC and the start of the nodes alone."""
 
     def __init__(
-        self, machine: Machine, controller: Any, bus: Bus, operator: Operator | None, sync: bool
+        self,
+        machine: Machine,
+        controller: Controller,
+        bus: Bus,
+        operator: Operator | None,
+        sync: bool,
     ) -> None:
         super().__init__(machine, controller, bus, operator or self.follow)
         bus.allowed = (canopen.NMT, canopen.SYNC) if sync else ()
@@ -65,7 +69,7 @@ class Shadow(hw.Drive):
         moved_by[:, -1] = sent
         self.gate = self.gate._replace(sent=moved_by)
 
-    def control(self, counts: Array) -> Array:
+    def control(self, counts: Counts) -> Array:
         """The controller's command [counts of 127] (n,)."""
         answered = self.nodes.frames > 0
         if answered.any() and not answered.all():  # it has waited for the others
