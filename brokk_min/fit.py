@@ -202,7 +202,7 @@ class FitConfig:
 
 
 def as_they_are(history: Any) -> Any:
-    """13 angles, 13 velocities, 13 commands: (..., n, 39) of (..., n, 3, 13). Paper: Table 1"""
+    """13 angles, 13 velocities, 13 commands: (..., n, 39) of (..., n, 3, 13)."""
     return history.reshape(*history.shape[:-2], -1)
 
 

@@ -80,7 +80,7 @@ def nets() -> Rows:
     ends = -0.3 * np.ones(n), 0.3 * np.ones(n)
     names = tuple(BROKK.names[i] for i in BROKK.driven)
     net = actuator.ActuatorNet(
-        names, 13, 20.0, 4, "", 0 * scales, scales, *ends, *ends, tuple(weights), {}
+        names, 13, 20.0, 4, "", 0 * scales, scales, *ends, tuple(weights), {}
     )
     state, rows = net.reset(BROKK, START), {}
     for tick, u in enumerate([0.5 * np.eye(5)[0]] * 2 + [0.4 * np.ones(5)] * 4):

@@ -11,10 +11,12 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.free_runs import accumulated_loss
 from brokk_min.beyond.valve_nets import ValveNet, mu_law, open_indicator
 from brokk_min.fit import (
+    FitConfig,
     Log,
     Recording,
     TrainingSet,
     as_they_are,
+    fit,
     join_recordings,
     mean_squared_error,
     velocity_of,
@@ -41,9 +43,11 @@ def simple_system(seed, recordings, ticks=300):
     return Log(("boom", "stick"), tuple(result))
 
 
-def test_fit__learns_a_simple_system():
+@pytest.mark.parametrize(("fitted", "kind"), [(fit, FitConfig), (fit_nets, OurFitConfig)])
+def test_fit__learns_a_simple_system(fitted, kind):
+    """By the paper's recipe, and by ours."""
     log = simple_system(0, 25)
-    net = fit_nets(log, OurFitConfig(steps=500, batch_size=256), 0, BROKK_170)
+    net = fitted(log, kind(steps=500, batch_size=256), 0, BROKK_170)
     assert not isinstance(net, ValveNet)  # no machine, no dead zones
     result = score(net, simple_system(1, 6))
     for name in net.joints:
@@ -84,6 +88,9 @@ def test_fit__gives_each_member_of_an_ensemble_a_seed_of_its_own():
         assert type(alone) is ValveNet
         for one, every in zip(alone.weights, ensemble.weights, strict=True):
             np.testing.assert_array_equal(one, every[:, k])
+    paper = fit(log, FitConfig(3, 64), 2, BROKK_170, "brokk170")
+    same = fit_nets(log, OurFitConfig(3, 64, **PAPER_RECIPE), 2, BROKK_170, "brokk170")
+    assert type(same) is ActuatorNet and all(map(np.array_equal, same.weights, paper.weights))
     printed = fit_nets(log, replace(config, valve=False), 0, BROKK_170, "brokk170")
     assert type(printed) is ActuatorNet and printed.training["settings"]["members"] == 1
 

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from strategies import machines, posed, reals
 
+from brokk_min import env
 from brokk_min.actuator import PLANT
 from brokk_min.beyond.interface import INTERFACE, Memory
-from brokk_min.env import PAPER, initial_state, reward, step, terminated
+from brokk_min.env import PAPER, initial_state, reward, terminated
 from brokk_min.kinematics import forward_kinematics, lowest_point
 from brokk_min.machine import Machine, Measured, limit_command
 from brokk_min.settings import TaskConfig
@@ -30,6 +31,21 @@ def test_reward__is_eq2(v, goal):
         error = math.sqrt(sum((a - b) ** 2 for a, b in zip(goal, v[i], strict=True)))
         np.testing.assert_allclose(r[i], 1 / (1 + error), rtol=1e-12)
     np.testing.assert_array_equal(reward(v, v), np.ones(v.shape[:-1]))
+
+
+class Direct(env.Interface):
+    """An agent whose actions are the commands."""
+
+    def command(self, machine, action, memory):
+        return action
+
+
+def one_tick(machine, config, state, u):
+    """State, reward, terminated, truncated after a tick without noise."""
+    task = env.Task(machine, PLANT, replace(config, noise=0.0), Direct())
+    now = env.Episodes(state, None, np.zeros(0))
+    after, r, end, truncated, _ = env.tick(task, np.random.default_rng(0), now, u)
+    return after.state, r, end, truncated
 
 
 # --- one tick -------------------------------------------------------------------------------------
@@ -53,7 +69,7 @@ def test_step__pays_eq2_of_the_true_velocity_and_nothing_in_the_ground(case):
     for given_array in (*state, *state.plant, u):
         if isinstance(given_array, np.ndarray):
             given_array.setflags(write=False)  # a write in place would raise
-    after, r, end, truncated = step(machine, TaskConfig(noise=0.0), PLANT, state, u)
+    after, r, end, truncated = one_tick(machine, TaskConfig(), state, u)
     q_dot = (after.q - q) * machine.rate
     tools = [forward_kinematics(machine, after.q + s * 1e-6 * q_dot).p[:, -1] for s in (1, -1)]
     error = np.linalg.norm(goals - (tools[0] - tools[1]) / 2e-6, axis=-1)
@@ -80,7 +96,7 @@ def test_step__ends_a_start_in_the_ground_and_truncates_at_the_time_limit(case):
     for before, limit in ((0, 1), (0, second), (1, second), (second - 1, second), (second, second)):
         config = TaskConfig(episode_s=limit / machine.rate)
         now = state._replace(ticks=np.full(3, before))
-        after, r, end, truncated = step(machine, config, PLANT, now, u)
+        after, r, end, truncated = one_tick(machine, config, now, u)
         ground = forward_kinematics(machine, after.q).p[:, 1:, 2].min(axis=-1) - machine.ground
         sure = np.abs(ground) > 1e-5  # single precision
         assert np.array_equal(end[sure], (ground < 0)[sure] & (before == 0))
