@@ -70,12 +70,12 @@ def frozen_times(counts: int, moving: bool, rng: np.random.Generator) -> np.ndar
         place, motion = expected_motion(m, gate, frozen)
         fault = (motion > 3 * still_counts(m) * m.encoder_step).any(axis=-1)
         found = np.where(fault & np.isinf(found), tick, found)
-        sent = np.zeros((num, m.n), int)
+        sent = np.zeros((num, m.n))
         before = np.abs(gate.sent[range(num), joint, -1])
-        sent[range(num), joint] = up * np.minimum(before + SLEW, counts)
+        sent[range(num), joint] = up * np.minimum(before + SLEW, counts / PWM_MAX)
         history = np.concatenate([gate.sent[..., 1:], sent[..., None]], axis=-1)
         gate = gate._replace(sent=history, place=place, motion=motion)
-        plant = PLANT.step(m, plant, sent / PWM_MAX)
+        plant = PLANT.step(m, plant, sent)
         if tick < first:
             frozen = np.rint(plant.q / m.encoder_step).astype(int)
         elif tick == first:

@@ -19,7 +19,7 @@ from brokk_min.can.canopen import Counts, Operator, OperatorInput
 from brokk_min.can.connection import Bus, stop_signals
 from brokk_min.can.safety_gate import GateInputs, gate, gate_start
 from brokk_min.env import measure
-from brokk_min.machine import PWM_MAX, Array, Controller, Machine, Measured
+from brokk_min.machine import Array, Controller, Machine, Measured
 
 ANSWER_TIME = 0.4  # of a tick after SYNC, in which the encoders must answer (assumed)
 
@@ -105,7 +105,7 @@ class Drive:
         self.nodes.listen(self.bus, answer_by, until_complete=True)
 
     def control(self, counts: Counts) -> Array:
-        """The controller's command [counts of 127] (n,) at angles `counts` [encoder counts]."""
+        """The controller's command u (n,) at angles `counts` [encoder counts]."""
         m = self.machine
         if (self.nodes.early | (self.nodes.frames != 1)).any():
             self.history = self.measured = None  # samples before a gap do not join those after it
@@ -114,14 +114,14 @@ class Drive:
         if self.history is None:
             self.history = initial_history(q, m.history)
         else:
-            sent = self.gate.sent[..., -1] / PWM_MAX  # what the gate let pass
+            sent = self.gate.sent[..., -1]  # what the gate let pass
             self.history = append_sample(self.history, sent, q, m.velocity_samples, m.dt)
         if not self.gate.driving:
             self.controller_state = self.controller.start(1)
         v_goal = np.array([self.operator_input.v_goal], np.float32)
         self.measured = measure(m, self.history, v_goal)
         u, self.controller_state = self.controller(self.measured, self.controller_state)
-        return np.asarray(np.rint(u[0] * PWM_MAX), float)
+        return np.asarray(u[0], float)
 
     def send_command(self, command: Array, counts: Counts) -> None:
         """Pass the safety gate, and send the valve frame once the gate was armed."""

@@ -13,7 +13,7 @@ from brokk_min import hw
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Counts, Operator, OperatorInput
 from brokk_min.can.connection import Bus
-from brokk_min.machine import PWM_MAX, Array, Controller, Machine
+from brokk_min.machine import Array, Controller, Machine
 
 EARLY = 0.15  # of a tick, by which positions may come early (assumed)
 
@@ -34,7 +34,7 @@ class Shadow(hw.Drive):
         self.sync = sync
         self.nodes.own_ids = ()  # frames of others are no fault
         self.nodes.nmt[:] = canopen.OPERATIONAL  # until they say otherwise
-        self.pairs: list[tuple[Array, Array]] = []  # would send, was sent; while it would drive
+        self.pairs: list[tuple[Array, Array]] = []  # u that it would send, that was sent
         self.faults: Counter[str] = Counter()  # ticks with each
 
     def begin(self) -> None:
@@ -62,7 +62,7 @@ class Shadow(hw.Drive):
         self.nodes.frames[:] = 0  # somebody else may ask more often
         self.nodes.heartbeat[:] = self.bus.now()  # nobody has set up heartbeats
         recent = self.nodes.enable and self.bus.now() - self.nodes.valve_time < canopen.WATCHDOG
-        sent = np.rint(PWM_MAX * self.nodes.u * recent)
+        sent = self.nodes.u * recent
         if self.gate.driving:
             self.pairs.append((self.gate.sent[:, -1], sent))
         moved_by = self.gate.sent.copy()  # history and gate go on from what was sent
@@ -70,7 +70,7 @@ class Shadow(hw.Drive):
         self.gate = self.gate._replace(sent=moved_by)
 
     def control(self, counts: Counts) -> Array:
-        """The controller's command [counts of 127] (n,)."""
+        """The controller's command u (n,)."""
         answered = self.nodes.frames > 0
         if answered.any() and not answered.all():  # it has waited for the others
             self.positions_time += self.machine.dt
@@ -82,11 +82,12 @@ class Shadow(hw.Drive):
         """Both commands compared joint by joint, and what the gate would have stopped."""
         m = self.machine
         would, sent = np.array(self.pairs, float).reshape(-1, 2, m.n).swapaxes(0, 1)
-        lines = [f"compared in {len(would)} of {self.ticks} ticks, in counts of {PWM_MAX}:"]
+        lines = [f"compared in {len(would)} of {self.ticks} ticks, in per cent of full command:"]
         for i in m.driven if len(would) else ():
             a, b = would[:, i], sent[:, i]
             r = f"{np.corrcoef(a, b)[0, 1]:+.2f}" if np.ptp(a) and np.ptp(b) else "none"
-            lines.append(f"  {m.names[i]}: correlation {r}, mean difference {np.mean(a - b):+.1f}")
+            difference = 100 * np.mean(a - b)
+            lines.append(f"  {m.names[i]}: correlation {r}, mean difference {difference:+.1f}")
         if np.isinf(self.nodes.valve_time):
             lines.append(f"no valve frame with identifier 0x{m.valve_frame_id:X} came")
         lines += [f"the gate would have stopped {k} ticks: {f}" for f, k in self.faults.items()]

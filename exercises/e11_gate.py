@@ -7,7 +7,7 @@ whatever the policy says, and no test of a policy can replace it:
   nothing is wrong. Held from the beginning is not enough; nor is an edge under a fault.
 - It drives as long as the switch is held and nothing is wrong.
 - A fault that goes away does not start it again. That takes the next edge.
-- A command grows by at most 40 counts a tick away from zero. It may shrink at once: closing a valve
+- A command grows by at most 40/127 a tick away from zero. It may shrink at once: closing a valve
   is never delayed. So a reversal begins again at zero.
 - At the end of its range a joint gets no command outward; inward it may go.
 
@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from brokk_min.can.canopen import OPERATIONAL
 from brokk_min.can.safety_gate import SLEW, GateInputs, GateState, gate, gate_start, limit_slew
-from brokk_min.machine import BROKK_170
+from brokk_min.machine import BROKK_170, PWM_MAX
 from exercises.verdict import agree, expect
 
 SOLUTION = "brokk_min/can/safety_gate.py: gate, limit_slew"
@@ -37,15 +37,15 @@ def drives(driving: bool, enable: bool, enable_before: bool, centred: bool, faul
     raise NotImplementedError
 
 
-def limit(command: int, last: int, can_rise: bool, can_fall: bool) -> int:
-    """The command [counts] that passes, after `last` [counts] a tick ago.
+def limit(command: float, last: float, can_rise: bool, can_fall: bool) -> float:
+    """The command in [-1, 1] that passes, after `last` a tick ago.
 
     `can_rise`: the joint is not at the upper end of its range; `can_fall`: not at the lower.
     """
     raise NotImplementedError
 
 
-def case(enable: bool, centred: bool, stop: bool, q: np.ndarray, command: int) -> GateInputs:
+def case(enable: bool, centred: bool, stop: bool, q: np.ndarray, command: float) -> GateInputs:
     """Inputs of one tick at which nothing is wrong but `stop`."""
     n = BROKK_170.n
     no = np.array(False)
@@ -66,7 +66,7 @@ def case(enable: bool, centred: bool, stop: bool, q: np.ndarray, command: int) -
     )
 
 
-def before(driving: bool, enable: bool, q: np.ndarray, last: int) -> GateState:
+def before(driving: bool, enable: bool, q: np.ndarray, last: float) -> GateState:
     """The gate a tick ago."""
     state = gate_start(BROKK_170)
     sent = state.sent.copy()
@@ -87,15 +87,15 @@ def our_drives(
     return bool(state.driving)
 
 
-def our_limit(command: int, last: int, can_rise: bool, can_fall: bool) -> int:
+def our_limit(command: float, last: float, can_rise: bool, can_fall: bool) -> float:
     """The package's answer, of joint q5; a joint at both ends of its range cannot move."""
     if not (can_rise or can_fall):
-        return 0
+        return 0.0
     joint = BROKK_170.joints[4]
     angle = {(True, True): 1.0, (False, True): joint.q_max, (True, False): joint.q_min}
     q = np.where(np.arange(5) == 4, angle[can_rise, can_fall], MIDDLE)
     inputs = case(True, False, False, q, command)
-    return int(limit_slew(BROKK_170, before(True, True, q, last), inputs)[4])
+    return float(limit_slew(BROKK_170, before(True, True, q, last), inputs)[4])
 
 
 def check(drives: Callable[..., bool], limit: Callable[..., int]) -> None:
@@ -113,11 +113,14 @@ def check(drives: Callable[..., bool], limit: Callable[..., int]) -> None:
         expect(f"drives{inputs}", bool(drives(*inputs)), wanted, f"That is: {why}.")
     for inputs in itertools.product([False, True], repeat=5):
         expect(f"drives{inputs}", bool(drives(*inputs)), our_drives(*inputs))
-    expect("limit(80, 0, True, True)", limit(80, 0, True, True), SLEW, f"{SLEW} counts a tick")
-    expect("limit(0, 80, True, True)", limit(0, 80, True, True), 0, "It may close at once.")
-    why = "A reversal begins again at zero."
-    expect("limit(-80, 80, True, True)", limit(-80, 80, True, True), -SLEW, why)
-    expect("limit(30, 20, False, True)", limit(30, 20, False, True), 0, "At the upper end")
-    expect("limit(-30, -20, False, True)", limit(-30, -20, False, True), -30, "Inward it may go.")
-    counts = st.integers(-80, 80)
-    agree("limit", limit, our_limit, st.tuples(counts, counts, st.booleans(), st.booleans()))
+    promised = {
+        (0.6, 0.0, True, True): (SLEW, f"{SLEW:.3f} a tick"),
+        (0.0, 0.6, True, True): (0.0, "It may close at once."),
+        (-0.6, 0.6, True, True): (-SLEW, "A reversal begins again at zero."),
+        (0.2, 0.1, False, True): (0.0, "At the upper end"),
+        (-0.2, -0.1, False, True): (-0.2, "Inward it may go."),
+    }
+    for inputs, (wanted, why) in promised.items():
+        expect(f"limit{inputs}", limit(*inputs), wanted, why)
+    u = st.integers(-80, 80).map(lambda counts: counts / PWM_MAX)
+    agree("limit", limit, our_limit, st.tuples(u, u, st.booleans(), st.booleans()))

@@ -190,8 +190,8 @@ def gate() -> Rows:
         "driving, a fault": (True, True, True, True, True),
     }
     rows: Rows = {what: str(our_drives(*case)) for what, case in cases.items()}
-    for last, command in ((0, 80), (60, -80), (80, 0), (-80, 0)):
-        rows[f"{command} counts after {last}"] = our_limit(command, last, True, True)
+    for last, command in ((0, 0.6), (0.5, -0.6), (0.6, 0), (-0.6, 0)):
+        rows[f"command {command} after {last}"] = our_limit(command, last, True, True)
     return rows
 
 

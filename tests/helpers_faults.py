@@ -111,7 +111,7 @@ def command(joint, value):
 
 # what goes wrong, and words of the reason that the program gives, or why it cannot find it
 SEND_ERROR = raises(can.CanOperationError("no buffer space"))
-THEIRS = valve_frame([77, 0, 0, 0, 0], 0, 1).tobytes()
+THEIRS = valve_frame(np.array([77, 0, 0, 0, 0]) / 127, 0, 1).tobytes()
 OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
 NOT_OPERATIONAL = "valve controller: not operational"
 EARLY, DOUBLED = "position before SYNC", "position doubled, not of 4 bytes"

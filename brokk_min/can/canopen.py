@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brokk_min.machine import PWM_MAX, Array, Machine, decode_pwm, encode_pwm, require
+from brokk_min.machine import Array, Machine, decode_pwm, encode_pwm, require
 
 Counts = NDArray[np.integer[Any]]  # whole numbers, such as bytes
 
@@ -189,14 +189,14 @@ def checksum(frame: ArrayLike) -> Counts:
     return crc ^ 0xFF
 
 
-def valve_frame(command: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Counts:
+def valve_frame(u: ArrayLike, counter: ArrayLike, enable: ArrayLike) -> Counts:
     """Bytes (..., 8): five PWM bytes, counter, checksum, enable.
 
-    `command` [counts of 127] is (..., n) with n at most 5. Paper: Sec. 3.2 (PWM bytes)
+    The commands `u` in [-1, 1] are (..., n) with n at most 5. Paper: Sec. 3.2 (PWM bytes)
     """
-    command = np.asarray(command)
-    frame = np.zeros((*command.shape[:-1], 8), np.uint8)
-    frame[..., : command.shape[-1]] = encode_pwm(command / PWM_MAX)
+    pwm = encode_pwm(u)
+    frame = np.zeros((*pwm.shape[:-1], 8), np.uint8)
+    frame[..., : pwm.shape[-1]] = pwm
     frame[..., 5] = counter
     frame[..., 7] = enable
     frame[..., 6] = checksum(frame[..., [0, 1, 2, 3, 4, 5, 7]])

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from brokk_min._files import brief, numbers, read_csv, require_package
 from brokk_min.can.canopen import OperatorInput
-from brokk_min.machine import PWM_MAX, Array, Machine, Measured, require
+from brokk_min.machine import Array, Machine, Measured, require
 
 PATIENCE = 5.0  # s that a script waits until the machine is ready
 
@@ -121,7 +121,7 @@ class JointJog:
 
     machine: Machine
     joint: str
-    counts: int  # of 127
+    u: float  # command in [-1, 1]
 
     def start(self, num: int) -> None:
         """It has no state."""
@@ -131,4 +131,4 @@ class JointJog:
         v_x = measured.v_goal[..., :1]
         side = np.sign(v_x) * (np.abs(v_x) > 0.1 * self.machine.tool_speed)
         chosen = np.array(self.machine.names) == self.joint
-        return side * chosen * self.counts / PWM_MAX, None
+        return side * chosen * self.u, None

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brokk_min.can.canopen import OPERATIONAL, Counts, valve_frame
-from brokk_min.machine import PWM_MAX, Array, Machine
+from brokk_min.machine import PWM_MAX, Array, Machine, limit_command
 
 Flag = NDArray[np.bool_]
 Words = NDArray[np.str_]
 
 # all assumed
 HEARTBEAT_TIMEOUT = 0.110  # s
-SLEW = 40  # counts of 127 per tick by which a command may grow
+SLEW = 40 / PWM_MAX  # of full command per tick, by which a command may grow
 END_STOP_MARGIN = 0.02  # rad or m before a joint's limit, from where no command goes outward
 RANGE_MARGIN = 0.05  # rad or m beyond a joint's limit, then the encoder is wrong
 JUMP_FACTOR = 2.0  # times the fastest motion,
@@ -34,7 +34,7 @@ class GateState(NamedTuple):
     """What the gate remembers, with the values of its start; arrays (...) unless noted."""
 
     counts: Counts  # newest angles [encoder counts], (..., n)
-    sent: Array  # commands of `OPENING_TIME`, newest last [counts of 127], (..., n, ticks)
+    sent: Array  # commands u of `OPENING_TIME` as on the bus, newest last, (..., n, ticks)
     place: Counts  # counts that the encoder has stayed at, (..., n)
     motion: Array  # of the joint since it came there, at least [rad], (..., n)
     driving: Flag = np.array(False)  # may the valves move?
@@ -49,7 +49,7 @@ class GateState(NamedTuple):
 class GateInputs(NamedTuple):
     """Inputs of one tick; the last node is the valve controller. Arrays (...) unless noted."""
 
-    command: Array  # of the controller [counts of 127], (..., n)
+    command: Array  # u of the controller in [-1, 1], (..., n)
     counts: Counts  # angles [encoder counts], (..., n)
     early: Flag  # did a position come before SYNC? (..., n)
     frames: Counts  # positions since SYNC, a malformed one counts 2, (..., n)
@@ -67,7 +67,7 @@ class GateInputs(NamedTuple):
 def gate_start(machine: Machine) -> GateState:
     """A gate that has just been switched on."""
     zero = np.zeros(machine.n, int)
-    sent = np.zeros((machine.n, int(np.ceil(OPENING_TIME * machine.rate))), int)
+    sent = np.zeros((machine.n, int(np.ceil(OPENING_TIME * machine.rate))))
     return GateState(counts=zero, sent=sent, place=zero, motion=np.zeros(machine.n))
 
 
@@ -87,12 +87,13 @@ def gate(
     driving = inputs.enable & (state.driving | edge) & (fault == "")
     latched = np.where(driving, "", np.where(state.driving, fault, state.latched_fault))
     moving = state.driving & driving  # in the tick that arms, the valves stay closed
-    command = np.where(moving[..., None], limit_slew(machine, state, inputs), 0).astype(int)
+    command = np.where(moving[..., None], limit_slew(machine, state, inputs), 0.0)
+    u = limit_command(machine, command)  # whole counts, as on the bus
     counter = (state.counter + 1) % 256
     trusted = inputs.alive & ~inputs.error  # a lost device is no release of the switch
     state = GateState(
         counts=inputs.counts,
-        sent=np.concatenate([state.sent[..., 1:], command[..., None]], axis=-1),
+        sent=np.concatenate([state.sent[..., 1:], u[..., None]], axis=-1),
         place=place,
         motion=motion,
         driving=driving,
@@ -103,11 +104,11 @@ def gate(
         time=now,
         counter=counter,
     )
-    return state, valve_frame(command, counter, driving)
+    return state, valve_frame(u, counter, driving)
 
 
 def limit_slew(machine: Machine, state: GateState, inputs: GateInputs) -> Array:
-    """Commands (..., n) that grow by `SLEW` at most and do not go outward at an end stop."""
+    """Commands u (..., n) that grow by `SLEW` at most and do not go outward at an end stop."""
     last = state.sent[..., -1]
     q = inputs.counts * machine.encoder_step
     can_rise = q < machine.column("q_max") - END_STOP_MARGIN
@@ -126,7 +127,7 @@ def expected_motion(machine: Machine, state: GateState, counts: Counts) -> tuple
     """
     idle, limit = IDLE_ZONES * machine.dead_zones.max(), machine.pwm_limit / PWM_MAX
     direction = np.sign(state.sent[..., -1:])
-    smallest = (direction * state.sent).min(axis=-1) / PWM_MAX
+    smallest = (direction * state.sent).min(axis=-1)
     opening = np.maximum(smallest - idle, 0.0) / max(limit - idle, 1 / PWM_MAX)
     slower = np.minimum(machine.column("q_dot_up"), machine.column("q_dot_down"))
     least = machine.dt * (SLOWEST * slower * opening)
@@ -149,7 +150,7 @@ def fault_table(
     low = machine.column("q_min") - RANGE_MARGIN
     high = machine.column("q_max") + RANGE_MARGIN
     jump = JUMP_FACTOR * machine.q_dot_max * machine.dt + JUMP_ANGLE + step
-    limit = np.zeros(machine.n)
+    limit = np.zeros(machine.n)  # counts; what is rounded to it is no fault
     limit[machine.driven] = machine.pwm_limit
     period = now - state.time
     age = now[..., None] - inputs.heartbeat  # below 0: nan and what is to come count as lost
@@ -168,7 +169,7 @@ def fault_table(
         "out of range": (q < low) | (q > high),
         "jumped": np.abs(q - state.counts * step) > jump,
         "frozen, or the joint does not move": motion > 3 * still_counts(machine) * step,
-        "no valid command": ~(np.abs(inputs.command) <= limit),  # nan, too
+        "no valid command": ~(np.abs(inputs.command) < (limit + 0.5) / PWM_MAX),  # nan, too
         "stop asked for": inputs.stop,
     }
 

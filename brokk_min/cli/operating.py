@@ -75,7 +75,7 @@ class DriveMachine(Command):
         check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
         limit = machine.pwm_limit
         check(0 < self.counts <= limit, "--counts", f"1 to {limit}", self.counts)
-        return JointJog(machine, self.joint, self.counts)
+        return JointJog(machine, self.joint, self.counts / PWM_MAX)
 
     def find_operator(self, machine: Machine) -> Any:
         """The joystick, or the script of a file; None: a shadow follows the tool."""
@@ -112,8 +112,7 @@ def status(drive: hw.Drive) -> str:
     if measured := drive.measured:
         vectors |= {"measured": measured.v_tool[0], "q": measured.q[0]}
     if isinstance(drive, Shadow) and drive.pairs:
-        would_send, sent = drive.pairs[-1]
-        vectors |= {"would send": would_send / PWM_MAX, "sent": sent / PWM_MAX}
+        vectors |= dict(zip(("would send", "sent"), drive.pairs[-1]))
     words += [f"{name} {' '.join(f'{x:+z.2f}' for x in row)}" for name, row in vectors.items()]
     return ", ".join(filter(None, [*words, f"late {1e3 * drive.lateness:.1f} ms"]))
 

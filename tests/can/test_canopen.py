@@ -42,12 +42,12 @@ def test_checksum__is_crc8_j1850():
 
 
 def test_valve_frame__by_hand():
-    frame = valve_frame([80, 0, -80, 50, -50], 9, True)
+    frame = valve_frame(np.array([80, 0, -80, 50, -50]) / 127, 9, True)
     assert frame.tolist() == [80, 0, 175, 50, 205, 9, 0x95, 1]
     u, enable = read_valve_frame(BROKK_170, frame.tobytes())
     np.testing.assert_allclose(u * 127, [80, 0, -80, 50, -50])
     assert enable
-    two = valve_frame([[1, -1], [0, 2]], [3, 4], [False, True])
+    two = valve_frame(np.array([[1, -1], [0, 2]]) / 127, [3, 4], [False, True])
     assert two.tolist() == [[1, 254, 0, 0, 0, 3, 0xCC, 0], [0, 2, 0, 0, 0, 4, 0xB6, 1]]
 
 

@@ -15,7 +15,7 @@ def test_dbc__describes_the_frames_that_the_program_uses():
     beats = {0x700 + node for node in (*encoders, controller)}
     used = {0x000, 0x080, 0x210, *beats, *(0x180 + node for node in encoders)}
     assert {message.frame_id for message in database.messages} == used
-    frame = valve_frame([80, 0, -80, 20, -60], 7, 1)
+    frame = valve_frame(np.array([80, 0, -80, 20, -60]) / 127, 7, 1)
     decoded = database.decode_message(0x210, frame.tobytes())
     assert decoded.pop("checksum") == frame[6]
     commands = {"u_q1": 80, "u_q2": 0, "u_q3": 175, "u_q4": 20, "u_q5": 195}

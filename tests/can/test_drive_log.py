@@ -64,11 +64,11 @@ def test_log_for_fit__by_hand():
     machine = replace(BROKK_170, rate=10.0)
     frames, parts = [], [range(15), range(16, 36), range(37, 51)]
     for k in chain(*parts):
-        t = 100 + k / 10
+        t, u = 100 + k / 10, np.array([80, 0, -80, 1, 0]) / 127
         frames.append(Frame(t, 0x080, b"", True))
         frames += [Frame(t, 0x180 + n, struct.pack("<I", 100 * n + k)) for n in range(1, 6)]
         frames.append(Frame(t, 0x555, b"\x01" * 8))
-        frames.append(Frame(t, 0x210, valve_frame([80, 0, -80, 1, 0], k, 1).tobytes(), True))
+        frames.append(Frame(t, 0x210, valve_frame(u, k, 1).tobytes(), True))
         frames.append(Frame(t, 0x210, b"\x01" * 7, True))
     log = log_for_fit(machine, frames)
     assert log.rate == 10 and [len(recording.q) for recording in log.recordings] == [15, 20]
@@ -89,7 +89,7 @@ def test_log_for_fit__by_hand():
 def test_read_telemetry__gives_at_each_sync_the_tick_before():
     goal = OperatorInput((0.1, 0.0, -0.12346), enable=True, stop=True).pack()
     assert goal == struct.pack("<hhhB", 1000, 0, -1235, 0b111)
-    q = np.array([0.0, 0.5, 0.6, 1.7, 1.2])
+    q, u = np.array([0.0, 0.5, 0.6, 1.7, 1.2]), np.array([50, 0, -80, 0, 0]) / 127
     frames = []
     for k in range(6):
         counts = np.rint((q + 0.01 * k) / STEP).astype(int)
@@ -98,7 +98,7 @@ def test_read_telemetry__gives_at_each_sync_the_tick_before():
             frames.append(Frame(0.0, 0x180 + node, struct.pack("<I", raw)))
         frames.append(Frame(0.0, OPERATOR_INPUT, goal, True))
         frames.append(Frame(0.0, OPERATOR_INPUT, bytes(7)))  # somebody else's
-        frames.append(Frame(0.0, 0x210, valve_frame([50, 0, -80, 0, 0], k, k > 0).tobytes()))
+        frames.append(Frame(0.0, 0x210, valve_frame(u, k, k > 0).tobytes()))
     frames += [Frame(0.3, 0x080, b""), Frame(0.35, 0x181, struct.pack("<I", 3))]  # a gap
     first, *_, last = read_telemetry(BROKK_170, [*frames, Frame(0.4, 0x080, b"")])
     assert not first.driving and not first.v_goal.any()

@@ -106,7 +106,7 @@ def test_joystick__refuses_a_device_without_its_axes_or_button(monkeypatch):
 
 
 def test_joint_jog__moves_one_joint_with_the_sign_of_x():
-    jog = JointJog(BROKK_170, "q4", 14)
+    jog = JointJog(BROKK_170, "q4", 14 / 127)
     for v_x, counts in ((0.1, 14), (-0.2, -14), (0.02, 0)):
         measured = SimpleNamespace(v_goal=np.array([[v_x, 0.1, -0.1]]))
         u, _ = jog(measured, jog.start(1))

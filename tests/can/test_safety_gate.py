@@ -16,6 +16,9 @@ RARE = {"stop": 0.03, "error": 0.03, "flooded": 0.02, "other_sender": 0.02}
 FLAGS = {"enable": 0.8, "centred": 0.7, "alive": 0.97} | RARE  # how often each input is set
 
 
+NO_COMMANDS = (np.nan, np.inf, -np.inf, 1e30, 81, -81, 80.5)  # counts
+
+
 def edge(near, margin):
     """A limit near `near` to which adding `margin` gives a whole number of counts."""
     whole = (np.arange(3000) - 1500) * STEP
@@ -37,7 +40,7 @@ def tight_machine():
 def plain_motion(machine, s, count, j):
     """The place that the encoder of joint `j` has stayed at, and the motion [rad] since then."""
     joint = machine.joints[j]
-    sent = s.sent[j].tolist()
+    sent = (s.sent[j] * 127).round().tolist()
     idle = 1.5 * max(max(each.dead_zone) for each in machine.joints)
     smallest = min(sent) / 127 if sent[-1] > 0 else -max(sent) / 127
     if smallest <= idle or abs(int(count) - int(s.place[j])) > 1:
@@ -67,7 +70,7 @@ def plain_node(machine, s, i, now, node):
         "out of range": not joint.q_min - 0.05 <= q <= joint.q_max + 0.05,
         "jumped": abs(q - before) > jump,
         "frozen, or the joint does not move": motion > 3 * STEP,
-        "no valid command": not -limit <= i.command[node] <= limit,
+        "no valid command": not abs(float(i.command[node])) < (limit + 0.5) / 127,
     }
 
 
@@ -96,8 +99,8 @@ def plain_gate(machine, s, i, now):
     m = [0] * 5
     for j, joint in enumerate(machine.joints):
         if driving and s.driving:
-            last, q = int(s.sent[j][-1]), i.counts[j] * STEP
-            m[j] = min(max(int(i.command[j]), min(last, 0) - 40), max(last, 0) + 40)
+            last, q = round(s.sent[j][-1] * 127), i.counts[j] * STEP
+            m[j] = min(max(round(float(i.command[j]) * 127), min(last, 0) - 40), max(last, 0) + 40)
             if (m[j] > 0 and q >= joint.q_max - 0.02) or (m[j] < 0 and q <= joint.q_min + 0.02):
                 m[j] = 0
     trusted = i.alive and not i.error
@@ -112,7 +115,7 @@ def plain_gate(machine, s, i, now):
         time=now,
         counter=counter,
         counts=i.counts,
-        sent=[[*old[1:], new] for old, new in zip(s.sent, m, strict=True)],
+        sent=[[*old[1:], new / 127] for old, new in zip(s.sent, m, strict=True)],
         place=[place for place, _ in stays],
         motion=[angle for _, angle in stays],
     )
@@ -140,7 +143,7 @@ def draw_inputs(machine, rng):
     m[..., machine.locked] = 0
     beats = -rng.uniform(0, 0.1, (*SHAPE, n + 1))
     return GateInputs(
-        command=put(rng, m, 0.01, np.nan, np.inf, -np.inf, 1e300, 81, -81, 80.5, 1, -1),
+        command=put(rng, m, 0.01, *NO_COMMANDS, 80.4, -80.4, 0.4, 1, -1) / 127,
         counts=np.where(some(rng, 0.3, n), near, middle).astype(int),
         early=some(rng, 0.005, n),
         frames=put(rng, np.ones((*SHAPE, n), int), 0.01, 0, 2, 3),
@@ -173,16 +176,20 @@ def draw_state(machine, rng, counts):
         time=-put(rng, np.full(SHAPE, DT), 0.1, *late),
         counter=rng.choice([0, 1, 127, 254, 255], SHAPE),
         counts=last,
-        sent=np.where(some(rng, 0.02, n, 9), -sent, sent),
+        sent=np.where(some(rng, 0.02, n, 9), -sent, sent) / 127,
         place=counts + rng.integers(-2, 3, (*SHAPE, n)),
         motion=STEP * rng.choice([0.0, 1.5, 2.7, 3.2], (*SHAPE, n), p=[0.6, 0.1, 0.1, 0.2]),
     )
 
 
-@pytest.mark.parametrize(("machine", "seed"), [(BROKK_170, 0), (tight_machine(), 2)])
-def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed):
+@pytest.mark.parametrize(
+    ("machine", "seed", "dtype"), [(BROKK_170, 0, "f8"), (tight_machine(), 2, "f4")]
+)
+def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed, dtype):
+    """Commands are those of a PID or of a policy, in double or single precision."""
     rng = np.random.default_rng(seed)
     inputs = draw_inputs(machine, rng)
+    inputs = inputs._replace(command=inputs.command.astype(dtype))
     before = draw_state(machine, rng, inputs.counts)
     state, frame = gate(machine, before, inputs, np.zeros(SHAPE))
     results = []

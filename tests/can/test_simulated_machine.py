@@ -26,7 +26,8 @@ class Machine(SimulatedMachine):
         """Send SYNC and a valve frame; the commands in force [counts]."""
         if sync:
             self.take(0x080, now=now)
-        data = valve_frame([*counts, *[0] * (5 - len(counts))], counter, enable).tobytes()
+        u = np.array([*counts, *[0] * (5 - len(counts))]) / 127
+        data = valve_frame(u, counter, enable).tobytes()
         assert self.receive(Frame(now, BROKK_170.valve_frame_id, data)) == []
         return np.rint(127 * self.u).astype(int).tolist()
 
@@ -73,7 +74,7 @@ def watchdog(machine):
     machine.advance(100.01 + WATCHDOG + 0.005)
 
 
-FRAME = valve_frame([80, 0, 0, 0, 0], 9, 1).tobytes()
+FRAME = valve_frame(np.array([80, 0, 0, 0, 0]) / 127, 9, 1).tobytes()
 MALFORMED = "valve frame with a wrong length or checksum"
 
 

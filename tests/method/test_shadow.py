@@ -41,8 +41,8 @@ class RemoteControl:
 
 
 def to_and_fro(joint, tick):
-    """Somebody moves a joint with the remote control, [counts of 127]."""
-    return 40 * ((tick > 20) - 2 * (tick > 50) + (tick > 90)) * (np.arange(5) == joint)
+    """Somebody moves a joint with the remote control."""
+    return 40 / 127 * ((tick > 20) - 2 * (tick > 50) + (tick > 90)) * (np.arange(5) == joint)
 
 
 def shadowed(machine=BROKK_170, controller=None, operator=None, log=None, sync=False, period=0.05):
@@ -70,7 +70,7 @@ def test_shadow__compares_and_logs_what_it_would_send_and_sends_nothing(tmp_path
     assert len(drive.pairs) > 100 and drive.ticks == pytest.approx(120, abs=3)
     assert correlation(drive) > 0.6
     _, sent = np.array(drive.pairs).swapaxes(0, 1)
-    assert {40.0, 0.0, -40.0} == set(sent[:, Q4]) and not np.delete(sent, Q4, axis=1).any()
+    assert {40 / 127, 0.0, -40 / 127} == set(sent[:, Q4]) and not np.delete(sent, Q4, axis=1).any()
     frames = list(read_frames(tmp_path / "run.log"))
     ids = [frame.id for frame in frames]
     assert ids.count(0x210) == world.noise.count  # those of the remote control alone
@@ -79,7 +79,7 @@ def test_shadow__compares_and_logs_what_it_would_send_and_sends_nothing(tmp_path
     assert [data[:5] for data in logged][: len(expected)] == expected
     (recorded,) = log_for_fit(BROKK_170, frames).recordings  # the shadow as a record for `fit`
     assert set(np.rint(127 * recorded.u[:, Q4])) == {40, 0, -40}
-    told = " ".join(f"{x / 127:+.2f}" for x in drive.pairs[-1][0])
+    told = " ".join(f"{x:+.2f}" for x in drive.pairs[-1][0])
     assert f"would send {told}, sent +0.00 +0.00 " in status(drive)
 
 
@@ -97,10 +97,11 @@ def test_shadow__tells_an_encoder_of_the_wrong_sign(j):
 def test_report__by_hand():
     world, _ = shadowed()
     numbers = ((1, 4), (2, 2), (3, 3))
-    world.drive.pairs = [(np.array([0, 0, 0, m, 5]), np.array([0, 0, 9, n, 5])) for m, n in numbers]
+    pairs = [([0, 0, 0, m, 5], [0, 0, 9, n, 5]) for m, n in numbers]
+    world.drive.pairs = [(np.array(a) / 100, np.array(b) / 100) for a, b in pairs]
     world.drive.faults["q3: jumped"], world.drive.ticks = 2, 9
     assert world.drive.report().splitlines() == [
-        "compared in 3 of 9 ticks, in counts of 127:",
+        "compared in 3 of 9 ticks, in per cent of full command:",
         "  q1: correlation none, mean difference +0.0",
         "  q3: correlation none, mean difference -9.0",
         "  q4: correlation -0.50, mean difference -1.0",
