@@ -1,5 +1,6 @@
 """PPO: formulas by hand and against torch, a training written once more, refusals, Pendulum."""
 
+import re
 from dataclasses import replace
 
 import gymnasium
@@ -16,6 +17,8 @@ from brokk_min.settings import PPOConfig
 
 SIZES = {"total_steps": 96, "num_envs": 6, "horizon": 8, "epochs": 3, "minibatch_size": 20}
 SMALL = PPOConfig(learning_rate=3e-3, gae_lambda=0.7, max_grad_norm=0.5, log_std=-0.3, **SIZES)
+
+TASK = "brokk_min.learning.gym_env:brokk_min/Brokk170-v0"
 
 
 class Tape(VectorEnv):
@@ -286,35 +289,14 @@ def test_train__takes_a_last_minibatch_of_one_step():
 # --- an environment of Gymnasium ------------------------------------------------------------------
 
 
-def pendulums(num):
-    return gymnasium.make_vec(
-        "Pendulum-v1",
-        num_envs=num,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-    )
-
-
-def mean_return(agent, num=32):
-    """Mean return of the mean action over `num` episodes of 200 ticks."""
-    env = pendulums(num)
-    obs, _ = env.reset(seed=1000)
-    total = np.zeros(num)
-    for _ in range(200):
-        action = agent.actor(torch.as_tensor(obs, dtype=torch.float32)).detach().numpy()
-        obs, reward, *_ = env.step(action.clip(-2, 2))
-        total += reward
-    return total.mean()
-
-
-def test_train__swings_up_the_pendulum():
-    """Mean return above -400: hanging down gives -1,200, the best about -150.
-
-    A smaller batch than by default, a longer look ahead and larger steps; actions vary as widely as
-    torques (-2 to 2).
-    """
-    sizes = {"total_steps": 57_344, "num_envs": 32, "epochs": 4, "minibatch_size": 256}
-    config = PPOConfig(learning_rate=4e-3, target_kl=0.3, gamma=0.95, log_std=0.0, **sizes)
-    agent = ppo.train(pendulums(32), config, seed=0)
-    assert mean_return(agent) > -400
-    assert (agent.log_std < -0.3).all()  # learned
+@pytest.mark.parametrize(
+    ("task", "steps", "first", "last"),
+    [("Pendulum-v1", 60_000, (-1300, -1000), (-400, 0)), (TASK, 16_384, (0, 400), (0, 400))],
+)
+def test_main__trains_a_task_of_gymnasium_and_prints_its_returns(task, steps, first, last, capsys):
+    """A pendulum that hangs has -1,200, the best about -150. Ours has 1 at most in a tick."""
+    ppo.main(task, steps)
+    told = re.findall(r"^step (\d+): return (-?[\d.]+)$", capsys.readouterr().out, re.M)
+    returns = [float(found) for _, found in told]
+    assert first[0] <= returns[0] <= first[1] and last[0] <= returns[-1] <= last[1]
+    assert int(told[-1][0]) >= steps
