@@ -11,6 +11,7 @@ from helpers_machines import obedient_net, small_net
 from brokk_min._files import read_csv
 from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
 from brokk_min.beyond.interface import INTERFACE
+from brokk_min.beyond.muon import Muon
 from brokk_min.env import PAPER, TaskConfig
 from brokk_min.learning.checkpoint import prepare, train_policy
 from brokk_min.learning.gym_env import TaskVectorEnv
@@ -63,7 +64,7 @@ def test_prepare__begins_what_the_recipe_says(paper, critic):
     assert task.interface is (PAPER if paper else INTERFACE)
     assert isinstance(env, GroupVectorEnv) != critic
     assert advantages is (critic_advantages if critic else group_advantages)
-    assert isinstance(start.optimizer, torch.optim.Muon) != (paper or critic)
+    assert isinstance(start.optimizer, Muon) != (paper or critic)
     assert len(np.unique(state.ticks)) > 100 and state.ticks.max() > 0.95 * 400
     assert not state.ticks[state.lowest < 0].any()
     assert start.obs.shape == (256, len(task.interface.scale(BROKK_170)[0]))
