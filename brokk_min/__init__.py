@@ -5,7 +5,10 @@ machine. "Simulation" is the learned nets, "machine" the analytic plant or a rea
 bus. Nets learn from logs alone, and policies on the nets. Nothing here is a safety function.
 
 Read the files of this folder in the order machine, kinematics, actuator, fit, jacobian, settings,
-env, ppo, hw. They hold the paper's method. `beyond` holds our improvements, one file each.
+env, ppo, hw. They hold the paper's method, from a log to the byte of a valve: `fit` makes nets,
+`identification.net_file` keeps them, `env` simulates with them, `learning.gym_env` hands that to
+`ppo`, `learning.policy` keeps the agent, and `hw` runs it behind the gate of `can`. `beyond` holds
+our improvements, one file each.
 
 Conventions: SI units and radians; the base frame has z up; joints are in the order of
 `Machine.joints`; the last axis of an array runs over joints or x, y, z, leading axes are batches.

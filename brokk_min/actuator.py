@@ -72,13 +72,13 @@ HYDRAULICS = {"brokk170": Hydraulics(BROKK_CYLINDERS, pump_flow=0.00105)}  # m^3
 
 
 @lru_cache
-def hydraulics(machine: Machine) -> Hydraulics:
+def hydraulics_of(machine: Machine) -> Hydraulics:
     """The hydraulics of a machine, by default plain ones.
 
     ValueError: a cylinder's triangle that does not close, or a step that Euler cannot take.
     """
-    h = machine.hydraulics or Hydraulics()
-    h = HYDRAULICS[h] if isinstance(h, str) else h
+    own = machine.hydraulics or Hydraulics()
+    h = HYDRAULICS[own] if isinstance(own, str) else own
     for joint in machine.joints:
         cylinder = h.cylinders.get(joint.name, Cylinder())
         require(cylinder.rod > 0, f"{joint.name}.rod", "a positive number", cylinder.rod)
@@ -95,7 +95,7 @@ def hydraulics(machine: Machine) -> Hydraulics:
 @lru_cache
 def cylinder_column(machine: Machine, name: str) -> Array:
     """One number of the cylinders of all joints, (n,); read-only."""
-    of = hydraulics(machine).cylinders
+    of = hydraulics_of(machine).cylinders
     column = np.array([getattr(of.get(j, Cylinder()), name) for j in machine.names], float)
     column.setflags(write=False)
     return column
@@ -107,10 +107,11 @@ def cylinder_speeds(machine: Machine) -> Array:
 
     Where none is given, the joint's nominal speed is reached with the longest lever arm, `rod`.
     """
-    h = hydraulics(machine)
+    h = hydraulics_of(machine)
     rods = cylinder_column(machine, "rod")[:, None]
     nominal = np.stack([machine.column("q_dot_up"), machine.column("q_dot_down")], axis=-1) * rods
-    nominal /= (machine.pwm_limit / PWM_MAX - machine.dead_zones) / (1 - machine.dead_zones)
+    limit = machine.pwm_limit / PWM_MAX * np.array([1.0, -1.0])  # up, down
+    nominal /= np.abs(valve_opening(limit, machine.dead_zones[:, None]))
     given = [h.cylinders.get(name, Cylinder()).speed for name in machine.names]
     speeds = [own or row for own, row in zip(given, nominal.tolist(), strict=True)]
     return np.array(speeds) * h.gain
@@ -133,7 +134,7 @@ class AnalyticPlant:
         """The plant at rest at angles `q` [rad] (..., n)."""
         q = np.array(q, float)
         zero = np.zeros_like(q)
-        h = hydraulics(machine)
+        h = hydraulics_of(machine)
         delayed = np.zeros((*q.shape, round(h.delay / h.dt)))
         return PlantState(q, zero, zero, zero, delayed)
 
@@ -142,7 +143,7 @@ class AnalyticPlant:
 
         Paper: eq1, Sec. 3.2 (delay, direction, coupling by a pump, past movement), 3.3 (dead zone)
         """
-        steps = round(machine.dt / hydraulics(machine).dt)
+        steps = round(machine.dt / hydraulics_of(machine).dt)
         held = np.repeat(np.asarray(u, float)[..., None], steps, axis=-1)
         commands = np.concatenate([state.delayed, held], axis=-1)  # what the valve gets in turn
         openings = valve_opening(commands, machine.dead_zones[:, None])
@@ -172,15 +173,16 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
 
 def euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantState:
     """Spool, valve activation, cylinder speed and angle, `Hydraulics.dt` later."""
-    m, h = machine, hydraulics(machine)
+    m, h = machine, hydraulics_of(machine)
     dt = h.dt
     q, v, s, z, _ = state
     s_next = s + dt * (opening - s) / h.tau_spool  # ds/dt = (opening - s) / tau_s
-    open_valve = np.abs(s) > h.spool_threshold
-    tau = np.where(open_valve > z, h.tau_valve_up, h.tau_valve_down)
-    z_next = z + dt * (open_valve - z) / tau  # dz/dt = (open - z) / tau
+    target = np.where(np.abs(s) > h.spool_threshold, 1.0, 0.0)
+    tau = np.where(target > z, h.tau_valve_up, h.tau_valve_down)
+    z_next = z + dt * (target - z) / tau  # dz/dt = (target - z) / tau
     x = np.clip((z - h.valve_threshold) / (1 - h.valve_threshold), 0.0, 1.0)
-    # g = sqrt(smoothstep(x)): q5 answers 0.40 s after idle, as in Fig. 2b; without the root 0.44 s
+    # g = sqrt(smoothstep(x)): from idle q5 has 63 % of its speed after 0.40 s, as in the caption of
+    # Fig. 2b; without the root it would be 0.44 s
     g = np.sqrt(x * x * (3 - 2 * x))
     v_steady = by_direction(s, cylinder_speeds(m)) * s * g  # of the cylinder, were it alone
     flow = np.sum(np.abs(cylinder_column(m, "area") * v_steady), axis=-1, keepdims=True)
@@ -200,8 +202,8 @@ def euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantStat
 def initial_history(q: ArrayLike, samples: int) -> Array:
     """History of joints that stood still at `q` [rad] (..., n): (..., n, 3, samples).
 
-    Rows: angle [rad], velocity [rad/s], command [-1, 1]; newest sample last. The newest command was
-    sent one tick before the newest angle was measured. Paper: Table 1
+    Rows: angle [rad], velocity [rad/s], command [-1, 1]; newest sample last. A command is held from
+    one angle to the next, so beside q(t-12) ... q(t) stand u(t-13) ... u(t-1). Paper: Table 1
     """
     q = 1.0 * np.asarray(q)  # whole numbers become floats
     history = np.zeros((*q.shape, 3, samples), q.dtype)
@@ -210,7 +212,10 @@ def initial_history(q: ArrayLike, samples: int) -> Array:
 
 
 def append_command(history: Array, u: ArrayLike) -> Array:
-    """The nets' input (..., n, 3, H): a history and the command `u` (..., n) of the coming tick."""
+    """The nets' input (..., n, 3, H): q(t-12) ... q(t), and now u(t-12) ... u(t).
+
+    `u` (..., n) is the command of the coming tick. Paper: Table 1
+    """
     result = history.copy()
     result[..., 2, :-1] = history[..., 2, 1:]
     result[..., 2, -1] = u
@@ -246,7 +251,7 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> Array:
 
 
 class NetState(NamedTuple):
-    """State of a machine that nets move."""
+    """State of a machine that nets move. They go on from true angles: encoder steps move no arm."""
 
     q: Array  # joint angle [rad], (..., n)
     history: Array  # of the driven joints, from true angles, (..., n_driven, 3, H), float32
@@ -265,7 +270,7 @@ class ActuatorNet:
     history: int  # H, samples of q, q_dot and u
     rate: float  # Hz
     velocity_samples: int  # window of the velocity estimator that made the inputs
-    machine: str  # name of the machine, or of the log
+    machine: str  # its name, or empty if the log is of another one
     input_mean: Array  # (n, I)
     input_scale: Array  # (n, I)
     output_low: Array  # (n,) rad/s
@@ -308,7 +313,8 @@ class ActuatorNet:
     def step(self, machine: Machine, state: NetState, u: Array) -> NetState:
         """One tick, q_{t+1} = q_t + dt net(history, u), within the joints' ranges.
 
-        The nets are those of the driven joints; the others stand.
+        The nets are those of the driven joints (of a file `identification.net_file.select_nets`
+        takes them); the others stand.
         """
         driven = machine.driven
         low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]

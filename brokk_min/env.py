@@ -48,7 +48,7 @@ COMMAND_STD = 0.4  # of the largest command; runs of PIDs and policies had 0.30 
 def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
     """Deviations in the task of tool [m/s] (3,) and joint velocities [rad/s] (n,), measured.
 
-    Poses and speeds of goals are drawn as in training, in all directions. The joint velocities are
+    Poses and speeds are drawn as in training, directions anywhere. The joint velocities are
     the smallest that give the goal, pinv(J) v, cut at each joint's nominal speed, and at least 5 %
     of that speed.
     """
@@ -101,7 +101,8 @@ def measure(
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
     scale = observation_table(machine)
-    error = np.asarray(noise * scale.std[scale.measured])  # in the order of the table's noisy rows
+    error = np.asarray(noise * scale.std[scale.measured])
+    # as the table has them: 3 of the tool, the locked angles, 13 angles and 13 velocities a joint
     v_error, q_error, history_error = np.split(error, [3, 3 + len(machine.locked)], axis=-1)
     q[..., machine.locked] += q_error
     driven[..., :2, :] += history_error.reshape(*error.shape[:-1], -1, 2, machine.history)
@@ -142,8 +143,9 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
 class Interface:
     """What an agent reads, does and is paid for: the paper's. A subclass may do it otherwise.
 
-    `memory` is what an agent keeps from tick to tick, None before the first. In each tick it
-    remembers, observes and commands; once the machine has moved, `cost` is taken off the reward.
+    In each tick an agent remembers, observes and commands; once the machine has moved, `cost` is
+    taken off the reward. `memory` is what it keeps from tick to tick, None before the first. The
+    paper's keeps nothing and pays nothing, but `beyond.interface` does.
     """
 
     def scale(self, machine: Machine) -> tuple[Array, Array]:
@@ -287,7 +289,10 @@ class Task:
         return what(self.machine, self.config, rng, num)
 
     def ends(self, state: State) -> tuple[Bools, Bools]:
-        """Terminated: the episode began in the ground; truncated: its time is over. (num,)"""
+        """Terminated: it began in the ground; truncated: its time is over. (num,)
+
+        A reset cannot end an episode in Gymnasium, so one in the ground ends after its first tick.
+        """
         end = terminated(self.machine, state.lowest) & (state.ticks == 1)
         return end, (state.ticks >= round(self.config.episode_s * self.machine.rate)) & ~end
 
@@ -365,7 +370,7 @@ def restart(task: Task, rng: Rng, episodes: Episodes, ended: Bools) -> Episodes:
 
 
 def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
-    """`function` of all arrays in `Episodes`, a memory or a plant's state: tuples of arrays."""
+    """`function` of all arrays in `Episodes`, their `State`, the plant's state, and the memory."""
     if first is None:
         return None
     if isinstance(first, tuple):

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ Rng = np.random.Generator
 Rows = NDArray[np.intp]
 Weights = tuple[Array, ...]  # of nets, see `ActuatorNet`
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
+SEGMENT = 300  # samples, about, of one piece
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
 MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
 
@@ -38,7 +39,10 @@ MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
 
 
 class Recording(NamedTuple):
-    """One recording of a log: arrays (T, n) of command [-1, 1], angle [rad], velocity [rad/s]."""
+    """Arrays (T, n): command [-1, 1], angle [rad], velocity [rad/s].
+
+    A command u[k] is held from the angle q[k] to q[k + 1].
+    """
 
     name: str
     u: Array
@@ -70,10 +74,11 @@ def velocity_of(q: Array, samples: int, rate: float = 20.0) -> Array:
 
 
 def sine_command(rng: Rng, machine: Machine, ticks: int) -> Array:
-    """One sine of random amplitude (dead zone to limit) and frequency, (ticks,). Paper: Sec. 3.3
+    """One sine of random amplitude and frequency, (ticks,). Paper: Sec. 3.3
 
-    The paper prints no frequencies. These, 0.05 to 5 Hz, are as fast as a policy's commands: on
-    nets from slower sines policies learn to shake the valves.
+    A sine cannot always be "larger than the dead zone", so we take that for its amplitude. The
+    paper prints no frequencies. These, 0.05 to 5 Hz, are as fast as a policy's commands: on nets
+    from slower sines policies learn to shake the valves.
     """
     amplitude = rng.uniform(machine.dead_zones.min(), machine.pwm_limit / PWM_MAX)
     frequency = np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
@@ -94,7 +99,7 @@ class Excitation(NamedTuple):
     name: str = "sine"
     command: Callable[[Rng, Machine, int], Array] = sine_command
     start: Callable[[Rng, Machine, Rows], Array] = mid_range
-    push: float = 0.0  # s, for which a joint is pushed against a limit before its recording ends
+    push: float = 0.0  # s at a limit before a recording ends; in the paper it ends there at once
 
 
 SINE = Excitation()
@@ -105,7 +110,7 @@ def collect(
 ) -> Log:
     """Record a plant, one actuator at a time, `hours` for each. Paper: Sec. 3.3 (1 h)"""
     goal = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples per joint
-    rows = int(np.clip(goal // 300, 1, 100))  # segments of a joint that are simulated at once
+    rows = int(np.clip(goal // SEGMENT, 1, 100))  # recordings of a joint, simulated at once
     count = np.zeros(machine.n, int)
     recordings: list[list[tuple[str, Array, Array]]] = [[] for _ in machine.joints]
     title = f"record ({excitation.name})"
@@ -125,10 +130,10 @@ def collect(
 def record(
     machine: Machine, plant: Plant, joint: Rows, excitation: Excitation, rng: Rng
 ) -> tuple[Array, Array, Rows]:
-    """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves, and its last ticks.
+    """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves.
 
-    A row begins with `history` samples of an idle valve. It ends after its commands, or within two
-    counts of a limit, but not within a second.
+    Also how many samples of each row count (rows,): a row begins with `history` samples of an idle
+    valve, and ends after its commands or within two counts of a limit, but not within a second.
     """
     rows, ticks = np.arange(len(joint)), round(MAX_SEGMENT * machine.rate)
     q = excitation.start(rng, machine, joint)
@@ -144,8 +149,8 @@ def record(
     low, high = machine.column("q_min")[joint] + near, machine.column("q_max")[joint] - near
     at_limit = (q[:, rows, joint] < low) | (q[:, rows, joint] > high)
     late = np.arange(len(q)) > machine.history + machine.rate
-    pushed = np.cumsum(at_limit, axis=0) > excitation.push * machine.rate
-    ends = at_limit & pushed & late[:, None]
+    long_enough = np.cumsum(at_limit, axis=0) > excitation.push * machine.rate
+    ends = at_limit & long_enough & late[:, None]
     return commands, q, np.where(ends.any(axis=0), ends.argmax(axis=0), len(q))
 
 
@@ -159,22 +164,25 @@ class Samples(NamedTuple):
     q: Array  # rad
     q_dot: Array  # rad/s
     target: Array  # rad/s, output of the nets; none for the last sample of a recording
-    moves: NDArray[np.bool_]  # the joint is `driven` in this recording
+    moves: NDArray[np.bool_]  # is the joint `moving` in this recording?
     lengths: list[int]  # of the recordings
 
     def starts(self, before: int, after: int, step: int) -> Rows:
-        """Every `step`-th sample with `before` and `after` samples around it in its recording."""
+        """Every `step`-th sample that has `before` samples before it and `after` samples after it.
+
+        Both in its own recording: the one-step fit takes all with a history and one sample more.
+        """
         seams = np.cumsum([0, *self.lengths])
         parts = [np.arange(before, length - after, step) for length in self.lengths]
         return np.concatenate([seam + part for seam, part in zip(seams, parts, strict=False)])
 
     def windows(self, history: int, ticks: int) -> list[Rows]:
-        """Newest samples of windows of `history` samples, `ticks` before an end, of each joint."""
+        """Newest samples of each joint's windows, which have `ticks` samples after them."""
         ends = self.starts(history - 1, ticks, 1)
         return [ends[moves] for moves in self.moves[ends].T]
 
 
-def driven(recording: Recording) -> NDArray[np.bool_]:
+def moving(recording: Recording) -> NDArray[np.bool_]:
     """Which joints have a command or move in a recording (n,); a parked one may creep a little."""
     commanded = np.ptp(recording.u, axis=0) > COMMANDED
     return np.asarray(commanded | (np.ptp(recording.q, axis=0) > MOVED))
@@ -183,7 +191,7 @@ def driven(recording: Recording) -> NDArray[np.bool_]:
 def join_recordings(log: Log) -> Samples:
     """Join recordings; the target is the velocity of the coming tick, (q(t+dt) - q(t)) / dt."""
     lengths = [len(recording.q) for recording in log.recordings]
-    moves = np.repeat([driven(recording) for recording in log.recordings], lengths, axis=0)
+    moves = np.repeat([moving(recording) for recording in log.recordings], lengths, axis=0)
     u, q, q_dot = map(np.concatenate, list(zip(*log.recordings, strict=True))[1:])
     return Samples(u, q, q_dot, np.diff(q, axis=0, append=0) * log.rate, moves, lengths)
 
@@ -201,24 +209,16 @@ class FitConfig:
     hidden: int = 32  # units in each of the two hidden layers (paper: 32)
 
 
-def as_they_are(history: Any) -> Any:
-    """13 angles, 13 velocities, 13 commands: (..., n, 39) of (..., n, 3, 13)."""
-    return history.reshape(*history.shape[:-2], -1)
-
-
 class TrainingSet:
     """Windows of n joints as float32 tensors, and how inputs and outputs are scaled.
 
-    `inputs` makes of histories (..., n, 3, H), NumPy's or torch's, what nets read, (..., n, I).
     ValueError: a joint that never moves.
     """
 
-    def __init__(
-        self, log: Log, machine: Machine, inputs: Callable[[Any], Any] = as_they_are
-    ) -> None:
+    def __init__(self, log: Log, machine: Machine) -> None:
         import torch
 
-        self.log, self.machine, self.rate, self.inputs = log, machine, log.rate, inputs
+        self.log, self.machine, self.rate = log, machine, log.rate
         self.joined, H = join_recordings(log), machine.history
         self.windows = self.joined.windows(H, 1)  # newest samples of each joint's windows
         every = zip(self.joined.target.T, self.windows, strict=True)
@@ -227,9 +227,12 @@ class TrainingSet:
             wanted = f"a recording of {H + 1} samples or more in which it moves"
             require(len(np.unique(target)) > 1, f"joint {name}", wanted, "none")
         low, high = (np.array([f(target) for target in targets]) for f in (np.min, np.max))
-        margin = 0.05 * (high - low) + 1e-6  # rad/s
+        margin = 0.05 * (high - low) + 1e-6  # rad/s, because a sigmoid never reaches its ends
         signals = np.stack([self.joined.q, self.joined.q_dot, self.joined.u], dtype=np.float32)
-        mean, std = (np.repeat(x, H, axis=1) for x in self.moments(signals))  # alike in a window
+        read = self.read(signals)
+        parts = [read[at, j] for j, at in enumerate(self.windows)]
+        moments = (np.array([f(part, axis=0) for part in parts]) for f in (np.mean, np.std))
+        mean, std = (np.repeat(x, H, axis=1) for x in moments)  # (n, I); alike for all 13 samples
 
         def tensor(array: Array) -> Tensor:
             return torch.from_numpy(np.array(array, np.float32))
@@ -241,42 +244,27 @@ class TrainingSet:
         self.output_low, self.output_high = tensor(low - margin), tensor(high + margin)  # (n,)
         self.joint, self.window = torch.arange(len(targets)), torch.arange(1 - H, 1)
 
-    def moments(self, signals: Array) -> list[Array]:
-        """Mean and deviation of what nets read of samples (3, N, n) in the windows, (n, rows)."""
-        read = self.inputs(signals[..., None].transpose(1, 2, 0, 3))  # of one sample: (N, n, rows)
-        parts = [read[at, j] for j, at in enumerate(self.windows)]
-        return [np.array([f(part, axis=0) for part in parts]) for f in (np.mean, np.std)]
+    def read(self, signals: Array) -> Array:
+        """What nets read of each sample, (N, n, 3) of angles, velocities, commands (3, N, n)."""
+        return signals.transpose(1, 2, 0)
+
+    def inputs(self, history: Tensor) -> Tensor:
+        """13 angles, 13 velocities, 13 commands, (..., n, 39) of histories (..., n, 3, 13)."""
+        return history.flatten(-2)
 
     def histories(self, at: Tensor) -> Tensor:
         """Histories (batch, n, 3, H) whose newest samples are `at` (batch, n)."""
         time = at[..., None] + self.window  # (batch, n, H)
-        return self.samples[self.joint[:, None], :, time].movedim(-1, -2)
+        windows = self.samples[self.joint[:, None], :, time]  # (batch, n, H, 3)
+        return windows.movedim(-1, -2)
 
-    def nets(
-        self,
-        weights: Weights,
-        config: FitConfig,
-        seed: int,
-        name: str,
-        kind: Callable[..., ActuatorNet] = ActuatorNet,
-    ) -> ActuatorNet:
-        """Nets of a `kind` with these weights; what is kept beside them says how they were made."""
+    def nets(self, weights: Weights, config: FitConfig, seed: int, name: str) -> ActuatorNet:
+        """Nets with these weights; what is kept beside them says how they were made."""
         keys = ("input_mean", "input_scale", "output_low", "output_high")
         scales = {key: getattr(self, key).numpy() for key in keys}
         m, training = self.machine, {"seed": seed, "settings": asdict(config)}
         about = (self.log.joints, m.history, self.rate, m.velocity_samples, name)
-        return kind(*about, **scales, weights=weights, training=training)
-
-
-def fit_weights(data: TrainingSet, config: FitConfig, seed: int) -> Weights:
-    """Weights of one net for each joint, as in `ActuatorNet.weights`. Paper: Sec. 3.3 (Adam)"""
-    import torch
-
-    generator = torch.Generator().manual_seed(seed)
-    weights = initial_weights(data, config.hidden, generator)
-    optimizer = torch.optim.Adam(weights, fused=True)
-    minimise(data, mean_squared_error, data.windows, optimizer, generator, config)
-    return arrays(weights)
+        return ActuatorNet(*about, **scales, weights=weights, training=training)
 
 
 def initial_weights(data: TrainingSet, hidden: int, generator: Generator) -> list[Tensor]:
@@ -290,44 +278,11 @@ def initial_weights(data: TrainingSet, hidden: int, generator: Generator) -> lis
     return [weight.requires_grad_() for weight in weights]
 
 
-def minimise(
-    data: TrainingSet,
-    loss_function: Callable[[TrainingSet, list[Tensor], Tensor], Tensor],
-    windows: list[Rows],
-    optimizer: Optimizer,
-    generator: Generator,
-    config: FitConfig,
-) -> None:
-    """Steps on random windows of each joint; the learning rate falls to zero by a cosine."""
-    import torch
-
-    torch.set_num_threads(1)  # several wait in vain on busy cores
-    (group,) = optimizer.param_groups
-    for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
-        group["lr"] = 0.5 * config.learning_rate * (1 + math.cos(math.pi * step / config.steps))
-        size = (config.batch_size,)
-        rows = [torch.randint(len(at), size, generator=generator) for at in windows]
-        drawn = [torch.from_numpy(at)[row] for at, row in zip(windows, rows, strict=True)]
-        loss = loss_function(data, group["params"], torch.stack(drawn, dim=1))
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-
-
-def mean_squared_error(data: TrainingSet, weights: list[Tensor], at: Tensor) -> Tensor:
-    """MSE of velocities, of their range, for windows that end `at` (batch, n); summed over joints.
-
-    L = 1/B sum |(net(history) - (q(t + dt) - q(t)) / dt) / range|^2. Paper: Sec. 3.3
-    """
-    velocity = predict(data, weights, data.histories(at))
-    error = (velocity - data.target[data.joint, at]) / (data.output_high - data.output_low)
-    return error.square().mean(dim=0).sum()
-
-
 def predict(data: TrainingSet, weights: list[Tensor], history: Tensor) -> Tensor:
     """Velocities [rad/s] (batch, n) for histories (batch, n, 3, H), as `ActuatorNet.predict`.
 
-    A joint goes no farther than the recorded range, as in the simulation, where it has stops.
+    Then, as in `ActuatorNet.step`, a joint goes no farther than to a stop: here to an end of the
+    recorded range. Nets that had to learn the stops would brake before them (D9).
     """
     w1, b1, w2, b2, w3, b3 = weights
     x = (data.inputs(history) - data.input_mean) / data.input_scale
@@ -339,6 +294,55 @@ def predict(data: TrainingSet, weights: list[Tensor], history: Tensor) -> Tensor
     return velocity.clamp((data.q_low - q) * data.rate, (data.q_high - q) * data.rate)
 
 
+def mean_squared_error(data: TrainingSet, weights: list[Tensor], at: Tensor) -> Tensor:
+    """MSE for windows that end `at` (batch, n), summed over joints.
+
+    L = 1/B sum |(net(history) - (q(t + dt) - q(t)) / dt) / range|^2, where range is that of the
+    sigmoid's output, output_high - output_low. Paper: Sec. 3.3
+    """
+    velocity = predict(data, weights, data.histories(at))
+    error = (velocity - data.target[data.joint, at]) / (data.output_high - data.output_low)
+    return error.square().mean(dim=0).sum()
+
+
+def minimise(
+    data: TrainingSet,
+    optimizer: Optimizer,
+    generator: Generator,
+    config: FitConfig,
+    loss_function: Callable[[TrainingSet, list[Tensor], Tensor], Tensor] = mean_squared_error,
+    windows: list[Rows] | None = None,
+) -> None:
+    """Steps on random windows of each joint; the learning rate falls to zero by a cosine.
+
+    Another loss may need other `windows` than those of `data`: `beyond.free_runs`.
+    """
+    import torch
+
+    torch.set_num_threads(1)  # several wait in vain on busy cores
+    (group,), windows = optimizer.param_groups, windows or data.windows
+    for step in tqdm(range(config.steps), desc="fit nets", unit="step", disable=None):
+        group["lr"] = 0.5 * config.learning_rate * (1 + math.cos(math.pi * step / config.steps))
+        size = (config.batch_size,)
+        rows = [torch.randint(len(at), size, generator=generator) for at in windows]
+        drawn = [torch.from_numpy(at)[row] for at, row in zip(windows, rows, strict=True)]
+        loss = loss_function(data, group["params"], torch.stack(drawn, dim=1))
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+
+
+def fit_weights(data: TrainingSet, config: FitConfig, seed: int) -> Weights:
+    """Weights of one net for each joint, as in `ActuatorNet.weights`. Paper: Sec. 3.3 (Adam)"""
+    import torch
+
+    generator = torch.Generator().manual_seed(seed)
+    weights = initial_weights(data, config.hidden, generator)
+    optimizer = torch.optim.Adam(weights, fused=True)
+    minimise(data, optimizer, generator, config)
+    return arrays(weights)
+
+
 def arrays(weights: list[Tensor]) -> Weights:
     """Weights for `ActuatorNet`. ValueError: they are not finite."""
     finite = all(bool(weight.isfinite().all()) for weight in weights)
@@ -346,18 +350,11 @@ def arrays(weights: list[Tensor]) -> Weights:
     return tuple(weight.detach().numpy() for weight in weights)
 
 
-def fit(
-    log: Log,
-    config: FitConfig,
-    seed: int,
-    machine: Machine,
-    name: str = "",
-    method: Callable[[TrainingSet, FitConfig, int], Weights] = fit_weights,
-) -> ActuatorNet:
+def fit(log: Log, config: FitConfig, seed: int, machine: Machine, name: str = "") -> ActuatorNet:
     """The nets of each joint of a log; the same `seed` gives the same bits on one computer.
 
     `name` is that of `machine`, or empty for a log with other joints. ValueError: a joint that
     never moves long enough, or weights that are not finite at the end. Paper: Sec. 3.3
     """
     data = TrainingSet(log, machine)
-    return data.nets(method(data, config, seed), config, seed, name)
+    return data.nets(fit_weights(data, config, seed), config, seed, name)

@@ -2,8 +2,10 @@
 
 One tick: the operator's goal, SYNC, encoder positions, measurements, controller, gate, valve frame.
 Each encoder answers the frame SYNC with its position; `canopen.Nodes` keeps the newest position,
-heartbeat and state of each node. `safety_gate.gate` lets a command pass, or closes the valves on
-any fault until the operator releases the dead-man switch and presses it again ("arms").
+heartbeat and state of each node. A trained agent is a `Controller` as `learning.policy.Policy`.
+`safety_gate.gate` limits a command, or closes the valves on any fault until the operator releases
+the dead-man switch and presses it again ("arms"). What it lets pass becomes bytes by
+`machine.encode_pwm` in `canopen.valve_frame`.
 Nothing here is a safety function: keep the hard-wired emergency stop (docs/hardware.md).
 """
 
@@ -97,7 +99,7 @@ class Drive:
         self.operator_input = self.operator(bool(self.gate.driving), ready)
 
     def ask_positions(self) -> None:
-        """Send SYNC, and listen until all encoders have answered or their time is over."""
+        """Send SYNC, and listen until each encoder has answered once or the time is over."""
         self.nodes.early = self.nodes.frames > 0  # no answers to this SYNC
         self.nodes.frames[:] = 0
         self.bus.send(canopen.SYNC, b"")
@@ -114,7 +116,7 @@ class Drive:
         if self.history is None:
             self.history = initial_history(q, m.history)
         else:
-            sent = self.gate.sent[..., -1]  # what the gate let pass
+            sent = self.gate.sent[..., -1]  # (n,), what the gate let pass in the last tick
             self.history = append_sample(self.history, sent, q, m.velocity_samples, m.dt)
         if not self.gate.driving:
             self.controller_state = self.controller.start(1)
@@ -124,7 +126,7 @@ class Drive:
         return np.asarray(u[0], float)
 
     def send_command(self, command: Array, counts: Counts) -> None:
-        """Pass the safety gate, and send the valve frame once the gate was armed."""
+        """Pass the safety gate, and send its valve frame of PWM bytes once it was armed."""
         entered = self.operator_input
         inputs = GateInputs(
             command=command,

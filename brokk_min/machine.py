@@ -1,6 +1,7 @@
 """A machine as one frozen value: geometry, limits, valves, encoders, CAN identifiers.
 
-To port the project means to write another `Machine`; nothing else knows a Brokk. The numbers of
+To port the project means to write another `Machine`. Of the Brokk only `actuator` knows more: the
+hydraulics of the plant that stands in for it. The numbers of
 `BROKK_170` come from the paper, or are assumed (not the maker's data), or tuned (by our runs).
 """
 
@@ -37,7 +38,7 @@ class Joint:
     theta: float  # rad
     q_min: float  # rad
     q_max: float  # rad
-    q_dot_up: float  # rad/s, nominal speed towards q_max at the command limit
+    q_dot_up: float  # rad/s, nominal, towards q_max: at the command limit, amid the range
     q_dot_down: float  # rad/s, nominal speed towards q_min, a positive number
     encoder_node: int  # CANopen node id
     dead_zone: tuple[float, float] = (0.07, 0.07)  # up, down, of full command; paper: Sec. 3.3
@@ -63,10 +64,10 @@ class Machine:
     valve_frame_id: int  # CAN identifier of the valve frame
     controller_node: int  # CANopen node id of the valve controller
     q_start: tuple[float, ...] = ()  # rad, where experiments start; empty: mid-range
-    hydraulics: Any = None  # of the analytic plant alone: an `actuator.Hydraulics`, or its name
+    hydraulics: Any = None  # `actuator.Hydraulics`, or a name in `actuator.HYDRAULICS`
 
     def __hash__(self) -> int:
-        """By name, because `lru_cache` hashes a machine at each call."""
+        """By name, for speed alone: `lru_cache` would hash all fields at each call."""
         return hash(self.name)
 
     @property
@@ -165,7 +166,7 @@ BROKK_170 = Machine(
     valve_frame_id=0x210,  # CAN id; assumed
     controller_node=0x10,  # CANopen node id; assumed
     q_start=(1.5, 0.5, 0.58, 1.71, 1.24),  # rad; paper: Sec. 4.1
-    hydraulics="brokk170",  # by this name in `actuator`
+    hydraulics="brokk170",
 )
 
 
@@ -190,7 +191,7 @@ class Controller(Protocol):
 
 
 def by_direction(u: Array, pairs: ArrayLike) -> Array:
-    """Of `pairs` (..., 2), up and down, those for up where u (...) > 0, else those for down."""
+    """`pairs[..., 0]`, up, where u (...) > 0, else `pairs[..., 1]`, down."""
     pairs = np.asarray(pairs, u.dtype)
     return np.where(u > 0, pairs[..., 0], pairs[..., 1])
 

@@ -1,6 +1,7 @@
 """Proximal Policy Optimization (Schulman et al., 2017) in one file, to be read from top to bottom.
 
-It trains on a Gymnasium vector environment with Box spaces that resets in the same step. A
+It trains on a Gymnasium vector environment with Box spaces that resets in the same step;
+`learning.gym_env` makes one of `env.reset` and `env.step`. A
 truncated episode did not fail: its return goes on with the value of its own last observation. At a
 termination it stops. Advantages come from a critic, as in the paper; `train` also accepts another
 advantage function. `python -m brokk_min.ppo` trains an agent on a task of Gymnasium.
@@ -197,24 +198,17 @@ def begin(env: VectorEnv[Any, Any, Any], config: PPOConfig, seed: int) -> Checkp
     return Checkpoint(agent, optimizer, obs, 0, 0, config.learning_rate)
 
 
-def make_batch(
-    agent: Agent, rollout: Rollout, advantages: Tensor, returns: Tensor | None, update: int
-) -> dict[str, Tensor]:
-    """The steps of a rollout in one row, (T * N, ...); returns also scale the critic's output."""
-    batch = {"obs": rollout.obs, "actions": rollout.actions, "logprobs": rollout.logprobs}
-    batch["advantages"] = advantages
-    if returns is not None:
-        batch["returns"] = returns
-        agent.return_mean += (returns.mean() - agent.return_mean) / update  # of all batches
-        agent.return_var += (returns.var() - agent.return_var) / update
-    return {name: tensor.flatten(0, 1) for name, tensor in batch.items()}
+def rescale_critic(agent: Agent, returns: Tensor, update: int) -> None:
+    """Move the scale of the critic's output to the means over all `update` batches of returns."""
+    agent.return_mean += (returns.mean() - agent.return_mean) / update
+    agent.return_var += (returns.var() - agent.return_var) / update
 
 
 def improve(
     agent: Agent, optimizer: torch.optim.Optimizer, batch: dict[str, Tensor], config: PPOConfig
 ) -> dict[str, float]:
-    """`epochs` passes over a batch in minibatches; means of what `ppo_loss` says of them."""
-    parts = []
+    """`epochs` passes over a batch (T, N, ...) in minibatches; means of what `ppo_loss` says."""
+    batch, parts = {name: tensor.flatten(0, 1) for name, tensor in batch.items()}, []
     for _ in range(config.epochs):
         b_inds = torch.randperm(len(batch["obs"]))
         for mb_inds in torch.split(b_inds, config.minibatch_size):
@@ -231,7 +225,7 @@ def improve(
 
 
 def steered(learning_rate: float, approx_kl: float, config: PPOConfig) -> float:
-    """Lower after a large change of the policy, higher after a small one, as rl_games does."""
+    """Lower after a large change of the policy, higher after a small one, much as in rl_games."""
     if approx_kl > 1.5 * config.target_kl:
         return learning_rate / 1.2
     if approx_kl < 0.7 * config.target_kl:
@@ -257,13 +251,18 @@ def train(
     agent, optimizer, obs, global_step, update, rate = start or begin(env, config, seed)
     while global_step < config.total_steps:
         done = global_step / config.total_steps
-        optimizer.param_groups[0]["lr"] = rate * (1 - done)
+        optimizer.param_groups[0]["lr"] = rate * (1 - done)  # steered, times what is left
         if config.log_std_end is not None:
             agent.log_std.data.fill_(config.log_std + (config.log_std_end - config.log_std) * done)
         rollout, obs = collect_rollout(env, agent, obs, config.horizon)
         global_step += config.horizon * env.num_envs
         update += 1
-        batch = make_batch(agent, rollout, *advantage_function(agent, rollout, config), update)
+        advantages, returns = advantage_function(agent, rollout, config)
+        batch = {"obs": rollout.obs, "actions": rollout.actions, "logprobs": rollout.logprobs}
+        batch["advantages"] = advantages
+        if returns is not None:
+            batch["returns"] = returns
+            rescale_critic(agent, returns, update)
         metrics = improve(agent, optimizer, batch, config)
         if not math.isfinite(sum(metrics.values())):
             raise ValueError(f"loss: expected finite numbers at step {global_step}, got {metrics}")

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from mujoco.rollout import rollout
 
-from brokk_min.actuator import cylinder_column, cylinder_speeds, hydraulics, lever_arm
+from brokk_min.actuator import cylinder_column, cylinder_speeds, hydraulics_of, lever_arm
 from brokk_min.machine import Array, Joint, Machine, by_direction, valve_opening
 
 # All assumed.
@@ -79,7 +79,7 @@ class MujocoBrokk:
         model, data = build(machine, self.load, self.slope)
         flow, awake = flows(machine, state, u, self.pump)
         held = flow + state.force / STIFFNESS  # so that no weight moves a cylinder without flow
-        steps = round(machine.dt / hydraulics(machine).dt)
+        steps = round(machine.dt / hydraulics_of(machine).dt)
         physics, force = rollout(model, data, state.physics, held[:, None], nstep=steps)
         q = physics[:, -1, 1 : 1 + machine.n]  # the time stands before the angles
         q = np.clip(q, machine.column("q_min"), machine.column("q_max"))
@@ -95,7 +95,7 @@ def flows(machine: Machine, state: State, u: Array, pump: float) -> tuple[Array,
     A valve opens beyond its dead zone, once it has woken up. Oil flows through it by the root of
     the pressure that the load leaves (orifice equation), and all valves share one pump.
     """
-    m, h, area = machine, hydraulics(machine), cylinder_column(machine, "area")
+    m, h, area = machine, hydraulics_of(machine), cylinder_column(machine, "area")
     x = valve_opening(u, m.dead_zones)
     called = np.abs(x) > h.spool_threshold
     tau = np.where(called, h.tau_valve_up, h.tau_valve_down)
@@ -110,7 +110,7 @@ def flows(machine: Machine, state: State, u: Array, pump: float) -> tuple[Array,
 @lru_cache
 def build(machine: Machine, load: float, slope: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """MuJoCo's model of a machine with a load [kg] on a slope [deg], and memory to step it in."""
-    joints, tilt, h = machine.joints, np.deg2rad(slope), hydraulics(machine)
+    joints, tilt, h = machine.joints, np.deg2rad(slope), hydraulics_of(machine)
     tip = f"{joints[-1].a} 0 {joints[-1].d}"
     links = f'<site name="tool" pos="{tip}"/><geom size="0.2" pos="{tip}" mass="{load}"/>'
     for i in reversed(range(machine.n)):  # each link holds the next one
@@ -138,7 +138,7 @@ def link(machine: Machine, i: int, rest: str) -> str:
     Seen from the joint, foot and rod of the cylinder are at the angle `Cylinder.angle` + q.
     """
     j, before = machine.joints[i], machine.joints[i - 1]
-    cylinder = hydraulics(machine).cylinders[j.name]
+    cylinder = hydraulics_of(machine).cylinders[j.name]
     place = f'pos="{before.a} 0 {before.d}" euler="{before.alpha} 0 {j.theta}"' if i else ""
     foot = FEET[i], cylinder.base  # angle [rad], distance [m]
     rod = FEET[i] + cylinder.angle, cylinder.rod
@@ -157,7 +157,7 @@ def link(machine: Machine, i: int, rest: str) -> str:
 
 def actuator_of(machine: Machine, j: Joint) -> str:
     """MJCF of a cylinder: f = STIFFNESS (flow - speed), within what the relief valves leave."""
-    h, c = hydraulics(machine), hydraulics(machine).cylinders[j.name]
+    h, c = hydraulics_of(machine), hydraulics_of(machine).cylinders[j.name]
     moves = f'tendon="{j.name}"' if c.base else f'joint="{j.name}" gear="{c.rod}"'
     push = RELIEF * c.area  # N
     pull = push * (ROD_SIDE if c.base else 1)

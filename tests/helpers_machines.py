@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from brokk_min.actuator import ActuatorNet, hydraulics
+from brokk_min.actuator import ActuatorNet, hydraulics_of
 from brokk_min.beyond.strong_pid import StrongGains
 from brokk_min.env import Measured, measure
 from brokk_min.evaluation import baselines, sequences
@@ -18,7 +18,7 @@ DRIVEN = [0, 2, 3, 4]  # joints of the Brokk
 
 def coarse(machine: Machine, dt: float) -> Machine:
     """The machine with longer steps of Euler's rule [s]: faster to simulate."""
-    return replace(machine, hydraulics=replace(hydraulics(machine), dt=dt))
+    return replace(machine, hydraulics=replace(hydraulics_of(machine), dt=dt))
 
 
 LOW = replace(BROKK_170, name="low", ground=-100.0)  # no pose is in the ground

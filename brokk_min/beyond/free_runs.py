@@ -33,14 +33,13 @@ from brokk_min.machine import Array
 
 
 def fit_weights(
-    data: TrainingSet,
-    config: FitConfig,
-    seed: int,
-    ticks: int = 8,
-    weight_decay: float = 0.0,
-    newest_only: bool = False,
+    data: TrainingSet, config: FitConfig, seed: int, ours: tuple[int, float, bool]
 ) -> tuple[Array, ...]:
-    """Weights of one net for each joint; the second stage has a quarter of rate and batch."""
+    """Weights of one net for each joint; the second stage has a quarter of rate and batch.
+
+    `ours` are K, the decay of the weights (AdamW), and whether nets read the newest sample alone.
+    """
+    ticks, weight_decay, newest_only = ours
     generator = torch.Generator().manual_seed(seed)
     weights = fit.initial_weights(data, config.hidden, generator)
     if newest_only:
@@ -49,13 +48,13 @@ def fit_weights(
     long_windows = data.joined.windows(data.machine.history, ticks)
     several = ticks > 1 and all(map(len, long_windows))
     first = replace(config, steps=round(0.65 * config.steps)) if several else config
-    fit.minimise(data, fit.mean_squared_error, data.windows, optimizer, generator, first)
+    fit.minimise(data, optimizer, generator, first)
     if several:
         rate, fewer = config.learning_rate / 4, math.ceil(config.batch_size / 4)
         rest = replace(first, steps=config.steps - first.steps, learning_rate=rate)
         loss = partial(accumulated_loss, ticks=ticks)
         rest = replace(rest, batch_size=fewer)
-        fit.minimise(data, loss, long_windows, optimizer, generator, rest)
+        fit.minimise(data, optimizer, generator, rest, loss, long_windows)
     return fit.arrays(weights)
 
 

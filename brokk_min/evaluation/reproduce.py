@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min._files import write_csv, write_json
-from brokk_min.actuator import PLANT, ActuatorNet, Plant, hydraulics
+from brokk_min.actuator import PLANT, ActuatorNet, Plant, hydraulics_of
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.evaluation import baselines, claims, metrics, preliminary, report, sequences
 from brokk_min.fit import SINE, Excitation, Log, collect
@@ -135,7 +135,7 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
 
 def variations(machine: Machine) -> dict[str, Machine]:
     """Machines unknown to the controllers, by name; all numbers assumed."""
-    own = hydraulics(machine)
+    own = hydraulics_of(machine)
 
     def plant_with(**changes: Any) -> Machine:
         return replace(machine, hydraulics=replace(own, **changes))

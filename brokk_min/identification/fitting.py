@@ -1,23 +1,39 @@
 """Our fit: that of the paper, with what `beyond` adds and the settings ask for."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from brokk_min import fit as paper
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond import free_runs
 from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
-from brokk_min.fit import Log
+from brokk_min.fit import Log, TrainingSet
 from brokk_min.identification.fit_config import PAPER_RECIPE, OurFitConfig
 from brokk_min.machine import Array, Machine
 
 __all__ = ["PAPER_RECIPE", "OurFitConfig", "fit_nets"]
+
+
+class ValveTrainingSet(TrainingSet):
+    """A `TrainingSet` of nets that read `valve_inputs`; dead zones are (n, 2), float32."""
+
+    def __init__(self, log: Log, machine: Machine, zones: Array) -> None:
+        self.zones = zones
+        super().__init__(log, machine)
+
+    def read(self, signals: Array) -> Array:
+        """What nets read of each sample, (N, n, 4): histories of one sample."""
+        return np.asarray(valve_inputs(signals[..., None].transpose(1, 2, 0, 3), self.zones))
+
+    def inputs(self, history: Tensor) -> Tensor:
+        """`valve_inputs`, (..., n, 4 H) of histories (..., n, 3, H)."""
+        inputs: Tensor = valve_inputs(history, torch.from_numpy(self.zones), torch)
+        return inputs
 
 
 def fit_nets(
@@ -29,29 +45,19 @@ def fit_nets(
     """
     if not (name and config.valve):
         config = replace(config, valve=False, members=1)
-    method = paper.fit_weights
+    fit_weights = paper.fit_weights
     if config.rollout > 1 or config.weight_decay or config.newest_only:
-        ours: Any = {name: getattr(config, name) for name in ("weight_decay", "newest_only")}
-        method = partial(free_runs.fit_weights, ticks=config.rollout, **ours)
-    if not config.valve:
-        return paper.fit(log, config, seed, machine, name, method)
-    index = [machine.names.index(joint) for joint in log.joints]
+        ours = (config.rollout, config.weight_decay, config.newest_only)
+        fit_weights = partial(free_runs.fit_weights, ours=ours)
+    index = [machine.names.index(joint) for joint in log.joints] if config.valve else []
     zones = machine.dead_zones[index].astype(np.float32)
-    data = paper.TrainingSet(log, machine, valve_reader(zones))
+    data = ValveTrainingSet(log, machine, zones) if config.valve else TrainingSet(log, machine)
     seeds = range(seed * config.members, (seed + 1) * config.members)
-    each = [method(data, config, one) for one in seeds]
+    each = [fit_weights(data, config, one) for one in seeds]
+    net = data.nets(each[0], config, seed, name)
+    if not config.valve:
+        return net
     if config.members == 1:
-        return data.nets(each[0], config, seed, name, partial(ValveNet, dead_zones=zones))
+        return ValveNet(**vars(net), dead_zones=zones)
     weights = tuple(np.stack(of, axis=1) for of in zip(*each, strict=True))
-    return data.nets(weights, config, seed, name, partial(NetEnsemble, dead_zones=zones))
-
-
-def valve_reader(zones: Array) -> Callable[[Any], Any]:
-    """`valve_inputs` of histories, NumPy's or torch's, with dead zones (n, 2)."""
-    tensor = torch.from_numpy(zones)
-
-    def inputs(history: Any) -> Any:
-        numpy = isinstance(history, np.ndarray)
-        return valve_inputs(history, zones) if numpy else valve_inputs(history, tensor, torch)
-
-    return inputs
+    return NetEnsemble(**vars(net) | {"weights": weights}, dead_zones=zones)

@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 from tqdm import tqdm
 
 from brokk_min._files import brief
-from brokk_min.fit import COMMANDED, Log, Recording, Samples, driven, join_recordings
+from brokk_min.fit import COMMANDED, Log, Recording, Samples, join_recordings, moving
 from brokk_min.machine import Array, Machine
 
 # What is searched, all assumed.
@@ -58,7 +58,7 @@ def inspect(log: Log) -> dict[str, JointReport]:
     """A report of each joint that is driven in a log."""
     reports, samples = {}, join_recordings(log)
     for j, name in enumerate(tqdm(log.joints, desc="inspect", unit="joint", disable=None)):
-        recordings = [one for one in log.recordings if driven(one)[j]]
+        recordings = [one for one in log.recordings if moving(one)[j]]
         if recordings:
             rows = samples.moves[:, j]
             u, q, q_dot = (x[rows, j] for x in (samples.u, samples.q, samples.q_dot))

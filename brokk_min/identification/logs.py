@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min._files import brief, expected, whole_file, write_csv
-from brokk_min.fit import Log, Recording, Rows, driven, join_recordings, velocity_of
+from brokk_min.fit import Log, Recording, Rows, join_recordings, moving, velocity_of
 from brokk_min.identification.columns import TOPICS, Mapped, load_table
 from brokk_min.identification.readings import check_run, left_out, pieces_of
 from brokk_min.machine import Array, Machine, require
@@ -28,7 +28,7 @@ def split(log: Log) -> tuple[Log, Log]:
 
     ValueError: no two recordings drive the same joints.
     """
-    keys = [driven(recording).tobytes() for recording in log.recordings]
+    keys = [moving(recording).tobytes() for recording in log.recordings]
     scored = [keys.count(key) > 1 and keys[:i].count(key) % 10 == 0 for i, key in enumerate(keys)]
     wanted = "two or more (column run) that drive the same joints, or --test"
     require(any(scored), "recordings", wanted, len(log.recordings))

@@ -10,7 +10,7 @@ import pytest
 from helpers_cli import run
 from helpers_machines import POSE, Idle, coarse, obedient_net, one_by_one, pids, short_axes
 
-from brokk_min.actuator import cylinder_speeds, hydraulics
+from brokk_min.actuator import cylinder_speeds, hydraulics_of
 from brokk_min.evaluation import baselines, metrics, report, reproduce
 from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget
@@ -55,9 +55,9 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
     monkeypatch.setattr(reproduce, "QUICK", TINY)
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
     (tmp_path / "m.py").write_text(
-        "from dataclasses import replace\nfrom brokk_min.actuator import hydraulics\n"
+        "from dataclasses import replace\nfrom brokk_min.actuator import hydraulics_of\n"
         "from brokk_min.machine import BROKK_170\n"
-        "h = replace(hydraulics(BROKK_170), dt=0.025)\n"
+        "h = replace(hydraulics_of(BROKK_170), dt=0.025)\n"
         "COARSE = replace(BROKK_170, rate=10.0, hydraulics=h)\n"
     )
     out = tmp_path / "results"
@@ -103,8 +103,8 @@ def test_reproduce__results_hold_every_run_and_a_verdict_on_each_sentence(folder
 def test_variations__change_what_they_say():
     result, speeds = reproduce.variations(BROKK_170), cylinder_speeds(BROKK_170)
     assert len(result) == 8 and result["nominal"] is BROKK_170
-    assert hydraulics(result["supply flow -70 %"]).pump_flow == pytest.approx(0.000315)
-    assert hydraulics(result["delay +50 ms"]).delay == pytest.approx(0.09)
+    assert hydraulics_of(result["supply flow -70 %"]).pump_flow == pytest.approx(0.000315)
+    assert hydraulics_of(result["delay +50 ms"]).delay == pytest.approx(0.09)
     gains = {"valve gain -20 %": 0.8, "valve gain +20 %": 1.2, "up -15 %, down +15 %": [0.85, 1.15]}
     for name, gain in gains.items():
         np.testing.assert_allclose(cylinder_speeds(result[name]), speeds * gain)

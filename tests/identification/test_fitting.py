@@ -15,13 +15,12 @@ from brokk_min.fit import (
     Log,
     Recording,
     TrainingSet,
-    as_they_are,
     fit,
     join_recordings,
     mean_squared_error,
     velocity_of,
 )
-from brokk_min.identification.fitting import PAPER_RECIPE, OurFitConfig, fit_nets, valve_reader
+from brokk_min.identification.fitting import PAPER_RECIPE, OurFitConfig, ValveTrainingSet, fit_nets
 from brokk_min.identification.validation import free_run, score
 from brokk_min.machine import BROKK_170
 
@@ -142,8 +141,9 @@ def test_accumulated_loss__is_the_error_of_a_free_run(valve):
     config = OurFitConfig(steps=1, batch_size=4, rollout=3, valve=valve, members=1)
     net = fit_nets(log, config, 0, BROKK_170, "brokk170")
     net.weights[5][:] = 1.0  # upwards, by what the nets read
-    inputs = valve_reader(np.full((2, 2), 0.07, np.float32)) if valve else as_they_are
-    data, samples = TrainingSet(log, BROKK_170, inputs), join_recordings(log)
+    zones = np.full((2, 2), 0.07, np.float32)
+    data = ValveTrainingSet(log, BROKK_170, zones) if valve else TrainingSet(log, BROKK_170)
+    samples = join_recordings(log)
     span = (data.output_high - data.output_low).numpy()
     tops = samples.q.argmax(axis=0)
     at = np.array([[20, 40], [350, 700], tops])  # of each window and joint

@@ -24,13 +24,13 @@ from brokk_min.actuator import (
     cylinder_column,
     cylinder_speeds,
     estimate_velocity,
-    hydraulics,
+    hydraulics_of,
     initial_history,
     lever_arm,
 )
 from brokk_min.machine import BROKK_170, Joint, Machine
 
-BROKK = hydraulics(BROKK_170)
+BROKK = hydraulics_of(BROKK_170)
 FAST = replace(BROKK_170, rate=200.0)  # a tick is one step of 5 ms
 LIMIT = 80 / 127
 MIDDLE = np.array([0.0, 0.5, 0.5, 1.7, 1.0])
@@ -144,7 +144,7 @@ def test_hydraulics__that_cannot_be_are_refused_by_name_before_anything_moves(ch
 
 
 def test_the_brokk__has_the_hydraulics_of_the_design():
-    h = hydraulics(BROKK_170)
+    h = hydraulics_of(BROKK_170)
     assert (h.delay, h.dt, h.tau_spool, h.tau_cylinder) == (0.04, 0.005, 0.03, 0.03)
     assert (h.tau_valve_up, h.tau_valve_down, h.valve_threshold) == (0.15, 0.4, 0.8)
     assert h.spool_threshold == 0.01
@@ -156,7 +156,7 @@ def test_the_brokk__has_the_hydraulics_of_the_design():
 
 def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[dict[str, float]]:
     """The equations read line by line: one joint, one 5 ms step, one number at a time."""
-    m, h = machine, hydraulics(machine)
+    m, h = machine, hydraulics_of(machine)
     dt = h.dt
     joints = [{"q": float(a), "v": 0.0, "s": 0.0, "z": 0.0} for a in q]
     per_tick, late = round(1 / m.rate / dt), round(h.delay / dt)
