@@ -110,7 +110,8 @@ class Drive:
         """The controller's command u (n,) at angles `counts` [encoder counts]."""
         m = self.machine
         if (self.nodes.early | (self.nodes.frames != 1)).any():
-            self.history = self.measured = None  # samples before a gap do not join those after it
+            # not one position of each encoder since SYNC: later samples do not join earlier ones
+            self.history = self.measured = None
             return np.zeros(m.n)
         q = (counts[None] * m.encoder_step).astype(np.float32)  # as `machine.read_encoder`
         if self.history is None:
