@@ -8,9 +8,9 @@ from brokk_min.actuator import ActuatorNet, hydraulics
 from brokk_min.beyond.strong_pid import StrongGains
 from brokk_min.env import Measured, measure
 from brokk_min.evaluation import baselines, sequences
-from brokk_min.fit import Recording, velocity_of
+from brokk_min.fit import Log, Recording, velocity_of
 from brokk_min.jacobian import Gains
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170, Machine, read_encoder
 
 POSE = np.array([1.5, 0.5, 0.58, 1.71, 1.24])  # the paper's q_s
 DRIVEN = [0, 2, 3, 4]  # joints of the Brokk
@@ -132,6 +132,31 @@ def opened(opening: np.ndarray, up: float = 0.07, down: float = 0.07) -> np.ndar
 def line(name, start, slope, ticks, u=0.5):
     q = np.full((ticks, 1), start) + slope * np.arange(ticks)[:, None] / 20
     return Recording(name, np.full((ticks, 1), u), q, velocity_of(q, 4))
+
+
+def simple_system(seed, recordings, ticks=300):
+    """Two first-order joints, q_ddot = (gain u - q_dot) / tau, turned back at +-0.8 rad."""
+    rng = np.random.default_rng(seed)
+    gain, tau, shape = np.array([0.5, 1.0]), np.array([0.15, 0.3]), (recordings, 2)
+    q, q_dot = rng.uniform(-0.5, 0.5, shape), np.zeros(shape)
+    u_log, q_log = np.zeros((2, ticks, *shape))
+    for tick in range(ticks):
+        if tick % 8 == 0:
+            u = np.where(np.abs(q) > 0.8, -np.sign(q) * 0.6, rng.uniform(-1, 1, shape))
+        u_log[tick], q_log[tick] = u, q
+        for _ in range(10):
+            q, q_dot = q + 0.005 * q_dot, q_dot + 0.005 * (gain * u - q_dot) / tau
+    parts = zip(u_log.swapaxes(0, 1), q_log.swapaxes(0, 1), strict=True)
+    result = [Recording(f"r{i}", u, q, velocity_of(q, 4)) for i, (u, q) in enumerate(parts)]
+    return Log(("boom", "stick"), tuple(result))
+
+
+def is_replay(recording, plant, start):
+    """Does a plant have the recorded angles under the recorded commands?"""
+    state = plant.reset(BROKK_170, start)
+    for u, q in zip(recording.u, recording.q, strict=True):
+        np.testing.assert_allclose(q, read_encoder(BROKK_170, state.q), atol=1e-9)
+        state = plant.step(BROKK_170, state, u)
 
 
 def closed_form(q):

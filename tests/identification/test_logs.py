@@ -174,17 +174,6 @@ def test_read_log__refuses_a_sensor_that_is_slower_than_the_rows(tmp_path, every
     assert log.warnings == () and (speed_of(log) < 0.6).all()
 
 
-def test_join_recordings__marks_recordings_in_which_a_joint_is_driven():
-    """No joint that creeps a count under a stick at rest, but one that sags without a command."""
-    late, ones = np.arange(6) > 2, np.ones(6)
-    u = np.stack([0 * ones, 0.015 * late, 0.5 * late], 1)
-    q = np.stack([0.02 * late, 2 * np.pi / 4096 * late, ones], 1)
-    recordings = (Recording("sags", u, q, q), Recording("at a stop", u, 0 * q, q))
-    samples = logs.join_recordings(Log(("a", "b", "c"), recordings))
-    assert samples.moves.tolist() == [[True, False, True]] * 6 + [[False, False, True]] * 6
-    assert [w.tolist() for w in samples.windows(3, 2)] == [[2, 3], [], [2, 3, 8, 9]]
-
-
 GOOD = """run,time,u_a,q_a
 x,0.00,0.1,1.0
 x,0.05,0.2,1.1

@@ -1,11 +1,13 @@
-"""Validation by hand: one step and free runs."""
+"""Validation by hand: one step and free runs; the motion of tasks."""
 
 import numpy as np
 import pytest
-from helpers_machines import constant_net, line
+from helpers_machines import constant_net, is_replay, line
 
+from brokk_min.actuator import PLANT
 from brokk_min.fit import Log, Recording
-from brokk_min.identification.validation import score, warnings
+from brokk_min.identification.validation import score, task_log, warnings
+from brokk_min.machine import BROKK_170
 
 
 def test_score__is_that_of_the_last_velocity_and_of_free_runs_by_hand():
@@ -58,3 +60,16 @@ def test_warnings__name_nets_no_better_than_the_last_velocity():
     test = Log(("a",), (Recording("x", q_dot, np.cumsum(q_dot, axis=0) / 20, q_dot),))
     told = [[*warnings(score(constant_net([v], ("a",)), test))] for v in (0.1, 0.5)]
     assert told == [[], ["a: expected a net that errs less than the last velocity again, got more"]]
+
+
+def test_task_log__moves_driven_or_locked_joints_within_the_limits():
+    log = task_log(BROKK_170, 5, 20.0, np.random.default_rng(0), BROKK_170.q_start)
+    for i, recording in enumerate(log.recordings):
+        moved = np.flatnonzero(np.ptp(recording.q, axis=0) > 0.05).tolist()
+        assert moved == ([1] if i == 4 else [0, 2, 3, 4])  # q2 moves only alone
+        assert recording.u.shape == recording.q.shape == (400, 5)
+        counts = recording.u * 127
+        np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
+        assert np.abs(counts).max() <= 80 + 1e-9
+        assert np.mean(np.abs(counts[:, moved]) > 79) < 0.2
+        is_replay(recording, PLANT, BROKK_170.q_start)

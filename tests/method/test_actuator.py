@@ -13,24 +13,11 @@ from hypothesis.extra import numpy as npst
 from scipy.special import expit
 from strategies import machines, poses, reals
 
-from brokk_min.actuator import (
-    PLANT,
-    ActuatorNet,
-    Cylinder,
-    Hydraulics,
-    PlantState,
-    append_command,
-    append_sample,
-    cylinder_column,
-    cylinder_speeds,
-    estimate_velocity,
-    hydraulics,
-    initial_history,
-    lever_arm,
-)
+from brokk_min import actuator
+from brokk_min.actuator import PLANT, ActuatorNet, Cylinder, Hydraulics, PlantState, lever_arm
 from brokk_min.machine import BROKK_170, Joint, Machine
 
-BROKK = hydraulics(BROKK_170)
+BROKK = actuator.hydraulics(BROKK_170)
 FAST = replace(BROKK_170, rate=200.0)  # a tick is one step of 5 ms
 LIMIT = 80 / 127
 MIDDLE = np.array([0.0, 0.5, 0.5, 1.7, 1.0])
@@ -119,16 +106,13 @@ def test_a_machine_without_hydraulics__moves_as_fast_as_its_joints_say(with_rod)
         np.testing.assert_allclose((state.q - last.q) * machine.rate, q_dot, rtol=1e-3)
 
 
+DT = "hydraulics.dt: expected a whole part of 1/rate, not above any tau"
 BAD = [
     ({"cylinder": {"rod": -0.1}}, "q5.rod: expected a positive number, got -0.1"),
     ({"cylinder": {"angle": 0.0}}, "q5.angle: expected angles in (0, pi), got 0.000 to 2.000"),
     ({"cylinder": {"angle": 1.2}}, "q5.angle: expected angles in (0, pi), got 1.200 to 3.200"),
-    ({"dt": 0.02}, "hydraulics.dt: expected a whole part of 1/rate, not above any tau, got 0.02"),
-    ({"rate": 30.0}, "hydraulics.dt: expected a whole part of 1/rate, not above any tau"),
-    *(
-        ({tau: 0.004}, "hydraulics.dt: expected a whole part of 1/rate, not above any tau")
-        for tau in ("tau_spool", "tau_cylinder", "tau_valve_up", "tau_valve_down")
-    ),
+    *[({"dt": 0.02}, f"{DT}, got 0.02"), ({"rate": 30.0}, DT)],
+    *(({f"tau_{x}": 0.004}, DT) for x in ("spool", "cylinder", "valve_up", "valve_down")),
 ]
 
 
@@ -144,11 +128,13 @@ def test_hydraulics__that_cannot_be_are_refused_by_name_before_anything_moves(ch
 
 
 def test_the_brokk__has_the_hydraulics_of_the_design():
-    h = hydraulics(BROKK_170)
+    h = actuator.hydraulics(BROKK_170)
     assert (h.delay, h.dt, h.tau_spool, h.tau_cylinder) == (0.04, 0.005, 0.03, 0.03)
     assert (h.tau_valve_up, h.tau_valve_down, h.valve_threshold) == (0.15, 0.4, 0.8)
     assert h.spool_threshold == 0.01
-    np.testing.assert_array_equal(cylinder_speeds(BROKK_170)[4], [0.0425, 0.0833])
+    fast = replace(BROKK, tau_spool=0.005)  # as short as a step
+    assert actuator.hydraulics(replace(BROKK_170, hydraulics=fast)) == fast
+    np.testing.assert_array_equal(actuator.cylinder_speeds(BROKK_170)[4], [0.0425, 0.0833])
 
 
 # --- the plant's equations ------------------------------------------------------------------------
@@ -156,7 +142,7 @@ def test_the_brokk__has_the_hydraulics_of_the_design():
 
 def slow_plant(machine: Machine, q: list[float], commands: np.ndarray) -> list[dict[str, float]]:
     """The equations read line by line: one joint, one 5 ms step, one number at a time."""
-    m, h = machine, hydraulics(machine)
+    m, h = machine, actuator.hydraulics(machine)
     dt = h.dt
     joints = [{"q": float(a), "v": 0.0, "s": 0.0, "z": 0.0} for a in q]
     per_tick, late = round(1 / m.rate / dt), round(h.delay / dt)
@@ -220,7 +206,7 @@ def test_plant_step__is_its_equations(case):
 @given(driven_machines())
 def test_lever_arm__is_the_derivative_of_the_cylinder_length(case):
     machine, q, _ = case
-    base, rod, angle = (cylinder_column(machine, name) for name in ("base", "rod", "angle"))
+    base, rod, angle = (actuator.cylinder_column(machine, x) for x in ("base", "rod", "angle"))
     length = lambda x: np.sqrt((base - rod * np.cos(x)) ** 2 + (rod * np.sin(x)) ** 2)  # noqa: E731
     slope = (length(angle + q + 1e-6) - length(angle + q - 1e-6)) / 2e-6
     np.testing.assert_allclose(lever_arm(machine, q), np.where(base > 0, slope, rod), atol=1e-8)
@@ -230,28 +216,28 @@ def test_lever_arm__is_the_derivative_of_the_cylinder_length(case):
 
 
 def test_append_sample__and_append_command_by_hand():
-    h = initial_history(np.array([0.5, -1.0]), 3)
+    h = actuator.initial_history(np.array([0.5, -1.0]), 3)
     np.testing.assert_array_equal(h[1], [[-1, -1, -1], [0, 0, 0], [0, 0, 0]])
     h.setflags(write=False)
-    sent = append_command(h, [0.1, 0.2])
+    sent = actuator.append_command(h, [0.1, 0.2])
     np.testing.assert_array_equal(sent[0], [[0.5, 0.5, 0.5], [0, 0, 0], [0, 0, 0.1]])
     np.testing.assert_array_equal(sent[1], [[-1, -1, -1], [0, 0, 0], [0, 0, 0.2]])
-    seen = append_sample(h, [0.1, 0.2], np.array([0.6, -0.9]), 2, 0.05)
+    seen = actuator.append_sample(h, [0.1, 0.2], np.array([0.6, -0.9]), 2, 0.05)
     np.testing.assert_allclose(seen[0], [[0.5, 0.5, 0.6], [0, 0, 2], [0, 0, 0.1]])
     np.testing.assert_allclose(seen[1], [[-1, -1, -0.9], [0, 0, 2], [0, 0, 0.2]])
-    sent = append_command(seen, [0.3, 0.4])
+    sent = actuator.append_command(seen, [0.3, 0.4])
     np.testing.assert_allclose(sent[0], [[0.5, 0.5, 0.6], [0, 0, 2], [0, 0.1, 0.3]])
 
 
 @given(st.integers(2, 8), npst.arrays(np.float64, (3, 12), elements=reals(-3, 3)))
 def test_estimate_velocity__is_the_least_squares_slope_and_forgets_what_is_older(samples, q):
     q.setflags(write=False)
-    velocity = estimate_velocity(q, samples, 0.05)
+    velocity = actuator.estimate_velocity(q, samples, 0.05)
     time = 0.05 * np.arange(samples)
     fitted = [np.polyfit(time, row[-samples:], 1)[0] for row in q]
     np.testing.assert_allclose(velocity, fitted, atol=1e-8)
-    assert estimate_velocity(q.astype(np.float32), samples, 0.05).dtype == np.float32
-    assert estimate_velocity([0, 3, 6, 9], 4, 0.07) == pytest.approx(3 / 0.07)  # whole numbers
+    assert actuator.estimate_velocity(q.astype(np.float32), samples, 0.05).dtype == np.float32
+    assert actuator.estimate_velocity([0, 3, 6, 9], 4, 0.07) == pytest.approx(3 / 0.07)  # integers
 
 
 # --- nets -----------------------------------------------------------------------------------------

@@ -230,9 +230,7 @@ def test_draw_hold__is_whole_ticks_and_at_least_one(seconds, ticks):
 
 def test_draw_noise__is_uniform_up_to_the_largest():
     noise = env.draw_noise(BROKK_170, TaskConfig(), default_rng(0), 400)
-    assert noise.dtype == np.float32 and noise.shape == (
-        400,
-        env.observation_table(BROKK_170).measured.sum(),
-    )
+    size = env.observation_table(BROKK_170).measured.sum()
+    assert noise.dtype == np.float32 and noise.shape == (400, size)
     assert np.abs(noise).max() <= 0.05
     assert stats.kstest(noise[:, 7] / 0.1 + 0.5, "uniform").pvalue > 1e-3

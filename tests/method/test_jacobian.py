@@ -73,6 +73,7 @@ def test_controller__first_tick_of_a_p_controller_by_hand():
     joints = [replace(joint, dead_zone=(0.1, 0.2)) for joint in BROKK_170.joints]
     machine = replace(BROKK_170, name="own zones", joints=tuple(joints))
     c = controller(machine=machine, kp=1.5)
+    np.testing.assert_array_equal(c.start(2), np.zeros((4, 2, 4)))
     q_dot = np.linalg.pinv(J) @ GOAL  # at rest all weights are 1
     u, _ = c(steady(POSE, GOAL, machine=machine), c.start(1))
     np.testing.assert_allclose(127 * u[0, DRIVEN], opened(1.5 * q_dot, 0.1, 0.2), atol=1e-9)

@@ -67,6 +67,8 @@ def test_values__at_the_ends_of_the_allowed_ranges_are_machines(limit, samples, 
     fields = {"pwm_limit": limit, "velocity_samples": samples, "q_start": q_start}
     machine = changed(**fields)
     assert {name: getattr(machine, name) for name in fields} == fields
+    joints = tuple(replace(joint, dead_zone=(0.0, 0.0)) for joint in machine.joints)
+    assert changed(joints=joints, pwm_limit=1).pwm_limit == 1
 
 
 def test_the_brokk__has_the_numbers_of_the_paper_and_the_design():

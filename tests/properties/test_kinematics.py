@@ -5,13 +5,8 @@ from hypothesis import given
 from scipy.linalg import expm
 from strategies import moving, posed
 
-from brokk_min.kinematics import (
-    forward_kinematics,
-    jacobian,
-    lowest_point,
-    tool_position,
-    tool_velocity,
-)
+from brokk_min import kinematics
+from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.machine import Machine
 
 STEP = 1e-6  # rad, of central differences
@@ -77,7 +72,7 @@ def test_tool_velocity__is_the_derivative_along_the_motion(case):
     machine, q, q_dot = case
     ahead = tool_position(forward_kinematics(machine, q + STEP * q_dot))
     behind = tool_position(forward_kinematics(machine, q - STEP * q_dot))
-    velocity = tool_velocity(forward_kinematics(machine, q), q_dot)
+    velocity = kinematics.tool_velocity(forward_kinematics(machine, q), q_dot)
     np.testing.assert_allclose(velocity, (ahead - behind) / (2 * STEP), atol=1e-7)
 
 
@@ -89,6 +84,6 @@ def test_single_precision__stays_single_and_close(case):
     assert single.p.dtype == single.z.dtype == jacobian(single).dtype == np.float32
     np.testing.assert_allclose(single.p, double.p, atol=2e-5)
     np.testing.assert_allclose(jacobian(single), jacobian(double), atol=2e-5)
-    velocity = tool_velocity(single, q_dot.astype(np.float32))
+    velocity = kinematics.tool_velocity(single, q_dot.astype(np.float32))
     assert velocity.dtype == np.float32
-    np.testing.assert_allclose(velocity, tool_velocity(double, q_dot), atol=5e-5)
+    np.testing.assert_allclose(velocity, kinematics.tool_velocity(double, q_dot), atol=5e-5)
