@@ -69,6 +69,9 @@ def test_collect__drives_each_joint_alone_for_the_requested_time(kind, plant):
         edge = segment.q[-2:, joint]
         at_limit = edge.min() < (LOW + tick)[joint] or edge.max() > (HIGH - tick)[joint]
         assert len(segment.q) == 613 or (at_limit and len(segment.q) > 33)  # a second at least
+        edges = np.array([[LOW], [-HIGH]])[..., joint] + 2 * BROKK_170.encoder_step[joint]
+        held = np.sum(np.array([[1], [-1]]) * segment.q[:, joint] < edges)
+        assert len(segment.q) == 613 or held >= 20 * (kind is RICH)  # pushed for a second
 
 
 def test_join_recordings__marks_recordings_in_which_a_joint_is_driven():
