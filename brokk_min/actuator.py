@@ -181,8 +181,8 @@ def euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantStat
     tau = np.where(target > z, h.tau_valve_up, h.tau_valve_down)
     z_next = z + dt * (target - z) / tau  # dz/dt = (target - z) / tau
     x = np.clip((z - h.valve_threshold) / (1 - h.valve_threshold), 0.0, 1.0)
-    # g = sqrt(smoothstep(x)): from idle q5 has 63 % of its speed after 0.40 s, as in the caption of
-    # Fig. 2b; without the root it would be 0.44 s
+    # g = sqrt(smoothstep(x)): from idle q5 has 63 % of its speed after 0.40 s (paper: about 0.4 s,
+    # Past Movement); without the root it would be 0.44 s
     g = np.sqrt(x * x * (3 - 2 * x))
     v_steady = by_direction(s, cylinder_speeds(m)) * s * g  # of the cylinder, were it alone
     flow = np.sum(np.abs(cylinder_column(m, "area") * v_steady), axis=-1, keepdims=True)
@@ -251,7 +251,11 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> Array:
 
 
 class NetState(NamedTuple):
-    """State of a machine that nets move. They go on from true angles: encoder steps move no arm."""
+    """State of a machine that nets move.
+
+    Nets are fitted to encoder angles, but go on from true ones, because encoder steps move no arm.
+    What agents read has encoder angles: `env.State.history`.
+    """
 
     q: Array  # joint angle [rad], (..., n)
     history: Array  # of the driven joints, from true angles, (..., n_driven, 3, H), float32
@@ -305,7 +309,12 @@ class ActuatorNet:
         return np.asarray(1 / (1 + np.exp(-z))[..., 0])
 
     def reset(self, machine: Machine, q: ArrayLike) -> NetState:
-        """The nets as a `Plant`, at rest at angles `q` [rad] (..., n)."""
+        """The nets as a `Plant`, at rest at angles `q` [rad] (..., n).
+
+        ValueError: `fit` makes nets of all joints, but these must be of the driven ones.
+        """
+        fits = len(self.joints) == len(machine.driven)
+        require(fits, "nets", "those of driven joints (net_file.select_nets)", self.joints)
         q = np.array(q, float)
         at_rest = initial_history(q[..., machine.driven].astype(np.float32), self.history)
         return NetState(q, at_rest)
@@ -313,8 +322,7 @@ class ActuatorNet:
     def step(self, machine: Machine, state: NetState, u: Array) -> NetState:
         """One tick, q_{t+1} = q_t + dt net(history, u), within the joints' ranges.
 
-        The nets are those of the driven joints (of a file `identification.net_file.select_nets`
-        takes them); the others stand.
+        The nets are those of the driven joints; the others stand.
         """
         driven = machine.driven
         low, high = machine.column("q_min")[driven], machine.column("q_max")[driven]

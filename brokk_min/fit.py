@@ -132,8 +132,9 @@ def record(
 ) -> tuple[Array, Array, Rows]:
     """Commands and angles (T, rows, n) while joint `joint[k]` of row k moves.
 
-    Also how many samples of each row count (rows,): a row begins with `history` samples of an idle
-    valve, and ends after its commands or within two counts of a limit, but not within a second.
+    Also how many samples of each row count (rows,). A row begins with `history` samples of an idle
+    valve. It ends after 30 s of commands, or where q comes within two counts of a limit, but not in
+    the first second.
     """
     rows, ticks = np.arange(len(joint)), round(MAX_SEGMENT * machine.rate)
     q = excitation.start(rng, machine, joint)
@@ -148,7 +149,8 @@ def record(
     q, near = np.array(angles), 2 * machine.encoder_step[joint]
     low, high = machine.column("q_min")[joint] + near, machine.column("q_max")[joint] - near
     at_limit = (q[:, rows, joint] < low) | (q[:, rows, joint] > high)
-    late = np.arange(len(q)) > machine.history + machine.rate
+    second = machine.rate  # ticks
+    late = np.arange(len(q)) > machine.history + second
     long_enough = np.cumsum(at_limit, axis=0) > excitation.push * machine.rate
     ends = at_limit & long_enough & late[:, None]
     return commands, q, np.where(ends.any(axis=0), ends.argmax(axis=0), len(q))
@@ -212,7 +214,8 @@ class FitConfig:
 class TrainingSet:
     """Windows of n joints as float32 tensors, and how inputs and outputs are scaled.
 
-    ValueError: a joint that never moves.
+    Nets that read a history in another way have a subclass with `read`, of single samples, and
+    `inputs`, of histories. ValueError: a joint that never moves.
     """
 
     def __init__(self, log: Log, machine: Machine) -> None:
@@ -282,7 +285,7 @@ def predict(data: TrainingSet, weights: list[Tensor], history: Tensor) -> Tensor
     """Velocities [rad/s] (batch, n) for histories (batch, n, 3, H), as `ActuatorNet.predict`.
 
     Then, as in `ActuatorNet.step`, a joint goes no farther than to a stop: here to an end of the
-    recorded range. Nets that had to learn the stops would brake before them (D9).
+    recorded range. Nets that had to learn the stops would brake before them.
     """
     w1, b1, w2, b2, w3, b3 = weights
     x = (data.inputs(history) - data.input_mean) / data.input_scale

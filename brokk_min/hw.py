@@ -2,10 +2,11 @@
 
 One tick: the operator's goal, SYNC, encoder positions, measurements, controller, gate, valve frame.
 Each encoder answers the frame SYNC with its position; `canopen.Nodes` keeps the newest position,
-heartbeat and state of each node. A trained agent is a `Controller` as `learning.policy.Policy`.
-`safety_gate.gate` limits a command, or closes the valves on any fault until the operator releases
-the dead-man switch and presses it again ("arms"). What it lets pass becomes bytes by
-`machine.encode_pwm` in `canopen.valve_frame`.
+heartbeat and state of each node. A trained agent is the `Controller` `learning.policy.Policy`: it
+observes, takes the actor's mean, without noise, and makes u of it, as in `env`. The gate lets a
+command grow by 40 counts a tick at most, and not outward at an end stop, which training has not; on
+any fault it closes the valves until the operator presses the dead-man switch anew at zero goal
+("arms"). What it lets pass becomes bytes by `machine.encode_pwm` in `canopen.valve_frame`.
 Nothing here is a safety function: keep the hard-wired emergency stop (docs/hardware.md).
 """
 

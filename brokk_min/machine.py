@@ -1,6 +1,6 @@
 """A machine as one frozen value: geometry, limits, valves, encoders, CAN identifiers.
 
-To port the project means to write another `Machine`. Of the Brokk only `actuator` knows more: the
+To port the project means to write another `Machine`. Only `actuator` knows more of the Brokk: the
 hydraulics of the plant that stands in for it. The numbers of
 `BROKK_170` come from the paper, or are assumed (not the maker's data), or tuned (by our runs).
 """
@@ -38,7 +38,7 @@ class Joint:
     theta: float  # rad
     q_min: float  # rad
     q_max: float  # rad
-    q_dot_up: float  # rad/s, nominal, towards q_max: at the command limit, amid the range
+    q_dot_up: float  # rad/s, towards q_max at the command limit: the largest in the range
     q_dot_down: float  # rad/s, nominal speed towards q_min, a positive number
     encoder_node: int  # CANopen node id
     dead_zone: tuple[float, float] = (0.07, 0.07)  # up, down, of full command; paper: Sec. 3.3
