@@ -23,7 +23,7 @@ from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.evaluation import baselines, metrics, sequences
-from brokk_min.evaluation.reproduce import QUICK, Budget, Chain, fit_net, train
+from brokk_min.evaluation.reproduce import QUICK, Budget, Chain, fit_net, train_one
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.fit import Log, collect
 from brokk_min.identification import inspection, logs, validation
@@ -86,7 +86,7 @@ def make(options: Options, chain: Chain, net: ActuatorNet) -> None:
     """The policies and the gains that the folder lacks, side by side."""
     gains, driven = chain.out / "gains.json", select_nets(M, net)
     lacking = [name for name in options.policies if not (chain.out / POLICIES[name]).exists()]
-    jobs: dict[str, Callable[..., Any]] = {n: partial(train, chain, n, net) for n in lacking}
+    jobs: dict[str, Callable[..., Any]] = {n: partial(train_one, chain, n, net) for n in lacking}
     if not gains.exists():
         arguments = (M, driven, chain.budget.tuning, chain.seed, PLANT)
         jobs["gains"] = partial(baselines.tuned_baselines, *arguments)

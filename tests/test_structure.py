@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -79,3 +80,9 @@ def test_importing_the_package__changes_no_environment_and_imports_no_torch():
     code += "; print(dict(os.environ) == before, 'torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.split() == ["False", "True", "False"], done.stderr
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
+def test_benchmarks__can_be_imported(file):
+    """They take long, so that no test runs them whole."""
+    importlib.import_module(f"benchmarks.{file.stem}")
