@@ -289,6 +289,8 @@ def test_nets_as_a_plant__move_driven_joints_by_velocity_times_dt():
         np.testing.assert_allclose(state.q, q, atol=1e-5)
     assert state.q[1] == 0.5 and np.abs(state.q - MIDDLE)[DRIVEN].max() > 0.01
     assert state.q.dtype == np.float64 and state.history.dtype == np.float32
+    with pytest.raises(ValueError, match="^nets: expected those of driven joints"):
+        random_net(3, n=5).reset(BROKK_170, MIDDLE)
 
 
 def test_nets_as_a_plant__stop_joints_at_the_ends_of_their_range():
