@@ -75,13 +75,21 @@ HYDRAULICS = {"brokk170": Hydraulics(BROKK_CYLINDERS, pump_flow=0.00105)}  # m^3
 def hydraulics_of(machine: Machine) -> Hydraulics:
     """The hydraulics of a machine, by default plain ones.
 
-    ValueError: a cylinder's triangle that does not close, or a step that Euler cannot take.
+    ValueError: no such name, a cylinder of no joint, no pair of speeds, a triangle that does not
+    close, or a step that Euler cannot take.
     """
-    own = machine.hydraulics or Hydraulics()
-    h = HYDRAULICS[own] if isinstance(own, str) else own
+    h = machine.hydraulics or Hydraulics()
+    if isinstance(h, str):
+        require(h in HYDRAULICS, "hydraulics", f"one of {[*HYDRAULICS]}, or a value", h)
+        h = HYDRAULICS[h]
+    else:
+        known = set(h.cylinders) <= set(machine.names)
+        require(known, "cylinders", f"those of joints {[*machine.names]}", [*h.cylinders])
     for joint in machine.joints:
         cylinder = h.cylinders.get(joint.name, Cylinder())
         require(cylinder.rod > 0, f"{joint.name}.rod", "a positive number", cylinder.rod)
+        pair = cylinder.speed is None or np.shape(cylinder.speed) == (2,)
+        require(pair, f"{joint.name}.speed", "a pair, up and down", cylinder.speed)
         low, high = cylinder.angle + joint.q_min, cylinder.angle + joint.q_max
         closes = cylinder.base == 0 or 0 < low < high < np.pi
         require(closes, f"{joint.name}.angle", "angles in (0, pi)", f"{low:.3f} to {high:.3f}")
@@ -105,7 +113,7 @@ def cylinder_column(machine: Machine, name: str) -> Array:
 def cylinder_speeds(machine: Machine) -> Array:
     """Speeds of the cylinders up and down at full command [m/s], (n, 2).
 
-    Where none is given, the joint's nominal speed is reached with the longest lever arm, `rod`.
+    Where none is given, the joint has q_dot_up or q_dot_down with the longest lever arm, `rod`.
     """
     h = hydraulics_of(machine)
     rods = cylinder_column(machine, "rod")[:, None]
@@ -114,7 +122,9 @@ def cylinder_speeds(machine: Machine) -> Array:
     nominal /= np.abs(valve_opening(limit, machine.dead_zones[:, None]))
     given = [h.cylinders.get(name, Cylinder()).speed for name in machine.names]
     speeds = [own or row for own, row in zip(given, nominal.tolist(), strict=True)]
-    return np.array(speeds) * h.gain
+    result = np.array(speeds) * h.gain
+    result.setflags(write=False)
+    return result
 
 
 class PlantState(NamedTuple):

@@ -1,8 +1,8 @@
 """A machine as one frozen value: geometry, limits, valves, encoders, CAN identifiers.
 
 To port the project means to write another `Machine`. Only `actuator` knows more of the Brokk: the
-hydraulics of the plant that stands in for it. The numbers of
-`BROKK_170` come from the paper, or are assumed (not the maker's data), or tuned (by our runs).
+hydraulics of the plant that stands in for it. The numbers of `BROKK_170` come from the paper, or
+are assumed (not the maker's data), or tuned (by our runs).
 """
 
 from dataclasses import dataclass

@@ -109,6 +109,8 @@ def test_a_machine_without_hydraulics__moves_as_fast_as_its_joints_say(with_rod)
 DT = "hydraulics.dt: expected a whole part of 1/rate, not above any tau"
 BAD = [
     ({"cylinder": {"rod": -0.1}}, "q5.rod: expected a positive number, got -0.1"),
+    ({"cylinder": {"speed": 0.1}}, "q5.speed: expected a pair, up and down, got 0.1"),
+    ({"cylinders": {"boom": Cylinder()}}, "cylinders: expected those of joints ['q1', 'q2', "),
     ({"cylinder": {"angle": 0.0}}, "q5.angle: expected angles in (0, pi), got 0.000 to 2.000"),
     ({"cylinder": {"angle": 1.2}}, "q5.angle: expected angles in (0, pi), got 1.200 to 3.200"),
     *[({"dt": 0.02}, f"{DT}, got 0.02"), ({"rate": 30.0}, DT)],
@@ -121,10 +123,13 @@ def test_hydraulics__that_cannot_be_are_refused_by_name_before_anything_moves(ch
     cylinders = dict(BROKK.cylinders)
     cylinders["q5"] = replace(cylinders["q5"], **changes.pop("cylinder", {}))
     machine = replace(BROKK_170, rate=changes.pop("rate", 20.0))
-    machine = replace(machine, hydraulics=replace(BROKK, cylinders=cylinders, **changes))
+    changes = {"cylinders": cylinders, **changes}
+    machine = replace(machine, hydraulics=replace(BROKK, **changes))
     with pytest.raises(ValueError) as caught:
         PLANT.reset(machine, MIDDLE)
     assert str(caught.value).startswith(message)
+    with pytest.raises(ValueError, match=r"hydraulics: expected one of .*, got brok"):
+        PLANT.reset(replace(machine, name="typo", hydraulics="brok"), MIDDLE)
 
 
 def test_the_brokk__has_the_hydraulics_of_the_design():
