@@ -7,8 +7,8 @@ differs, so what a machine's return is above the mean of its group is due to its
     A_t = R_t - mean of R_t in the group,   R_t = r_t + gamma lambda R_{t+1},
 
 clipped at four standard deviations of all advantages; lambda is 1 in `learning.recipes`. The sum R
-stops where the goal changes and where the window ends, which is longer than gamma looks ahead. At
-its end all four go on from the state of one of them.
+stops where the goal changes and where the window ends: on average a window of 12 ticks cuts two
+thirds of the weight of what comes after (gamma = 0.94). Then all four go on as one of them.
 
 What it buys: after 30 million steps of the paper's agent on one net a joint (seed 0) the mean
 velocity error of the tool along x, y and z is 0.0169 m/s by groups, with minibatches of 1,024, in

@@ -63,7 +63,7 @@ FADE = 2 / 13  # of the history, tuned: e-fold of the weights of older velocitie
 WIDER, EARLY, LATE = 1.25, 0.25, 0.4  # tuned: times as wide, s after a valve was last closed
 EFFORT_COST = 0.03  # tuned: if all commands are at the limit
 TRAVEL_COST = 0.1  # tuned: if all commands change by the limit in a tick
-INTEGRAL_COST = 2.0  # tuned: of a metre of the error integral in a tick
+INTEGRAL_COST = 3.0  # tuned: of a metre of the error integral in a tick
 
 
 class Memory(NamedTuple):
@@ -203,7 +203,7 @@ class OurInterface(env.Interface):
         return np.where(resting[..., None], 0, limit_command(machine, u))
 
     def cost(self, machine: Machine, u: Array, u_before: Array, memory: Memory) -> Array:
-        """0.03 mean (u / limit)^2 + 0.1 mean |u - u_before| / limit + 2 |integral| [m], (...).
+        """0.03 mean (u / limit)^2 + 0.1 mean |u - u_before| / limit + 3 |integral| [m], (...).
 
         Some motions of more than three joints cancel at the tool. The first term keeps the policy
         from them, because in the end they push a joint against its stop.

@@ -31,7 +31,8 @@ SDO_TIMEOUT = 0.5  # s (assumed)
 MAX_FRAMES = 256  # read in a tick; with more the bus is flooded
 WATCHDOG = 0.150  # s without valid valve frame, then the controller closes the valves (assumed)
 MOST_JOINTS = 5  # in a valve frame
-WOULD_SEND = 0x7FE  # of valve frames of `shadow`; these two are in the log, never on the bus
+VALVES = 0x7F0  # and a joint's number: what is known of its valves, k and d up, k and d down
+WOULD_SEND = 0x7FE  # of valve frames of `shadow`; these three are in the log, never on the bus
 OPERATOR_INPUT = 0x7FF  # of the operator's input
 
 

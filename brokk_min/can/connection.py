@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from brokk_min._files import brief, require_package
-from brokk_min.can.canopen import OPERATOR_INPUT, WOULD_SEND, Frame
+from brokk_min.can.canopen import OPERATOR_INPUT, VALVES, WOULD_SEND, Frame
 
 
 @dataclass
@@ -72,6 +72,10 @@ class Bus:
     def log_input(self, data: bytes) -> None:
         """Log the operator's input, which is not on the bus."""
         self._log(self._message(OPERATOR_INPUT, data), "operator")
+
+    def log_valves(self, joint: int, data: bytes) -> None:
+        """Log what is known of the valves of a joint, which is not on the bus."""
+        self._log(self._message(VALVES + joint, data), "valves")
 
     def flush(self) -> None:
         """Write the log on, so that it survives the program's sudden end. OSError: a full disk."""

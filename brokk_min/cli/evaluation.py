@@ -9,8 +9,8 @@ from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.can.operator_input import read_commands
 from brokk_min.cli.options import Command, check, default_policy, find_plant
-from brokk_min.evaluation import baselines, metrics, sequences
-from brokk_min.evaluation.rollout import TITLES, valves_at_rest
+from brokk_min.evaluation import adaptive, baselines, metrics, sequences
+from brokk_min.evaluation.rollout import title, valves_at_rest
 from brokk_min.jacobian import JacobianController
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import Array, Controller, Machine
@@ -27,6 +27,7 @@ class Evaluate(Command):
     json: Path | None = None  # Also write all runs here.
     save_gains: Path | None = None  # Tune the PIDs though gains.json is beside POLICY; write it.
     num_starts: int = 16  # Without --starts: how many of the machine's.
+    adapt: bool = False  # Also each controller as it learns its valves: cold, and after a minute.
     seed: int = 0  # Of the noise, and of what is drawn and tuned.
 
     def __call__(self, machine: Machine) -> None:
@@ -40,7 +41,13 @@ class Evaluate(Command):
         net = policies["rl"].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
         controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
-        runs, _ = metrics.evaluate(machine, controllers, *self.task(machine), self.seed, plant)
+        commands, starts = self.task(machine)
+        if self.adapt:
+            rows, motions = len(commands) * len(starts), adaptive.warm_up_motions(machine)
+            controllers |= adaptive.cold_and_warm(
+                controllers, net, machine, machine, rows, motions, plant
+            )
+        runs, _ = metrics.evaluate(machine, controllers, commands, starts, self.seed, plant)
         runs = [run | {"kind": "file"} for run in runs] if self.starts else runs
         if self.json:
             meta = {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
@@ -78,12 +85,12 @@ class Evaluate(Command):
 def table(runs: Sequence[metrics.Run]) -> str:
     """Means by controller."""
     num, motions = (len(metrics.column(runs, label)) for label in ("start", "sequence"))
-    row = "{:26}{:>15}" + "{:>15}" * len(metrics.COLUMNS)
+    row = "{:38}{:>15}" + "{:>15}" * len(metrics.COLUMNS)
     lines = [f"means over {motions} sequences from {num} starts"]
     lines.append(row.format("", "valves at rest", *metrics.COLUMNS.values()))
     for name, rows in metrics.means(runs).items():
         cells = (f"{rows['all'][key]['mean']:.4g}" for key in metrics.COLUMNS)
-        lines.append(row.format(TITLES[name], valves_at_rest(name), *cells))
+        lines.append(row.format(title(name), valves_at_rest(name), *cells))
     return "\n".join(lines)
 
 

@@ -19,7 +19,7 @@ from brokk_min.cli.options import Command, check, check_settings, find_plant
 from brokk_min.fit import SINE, Log, collect
 from brokk_min.identification import columns, logs
 from brokk_min.identification.fit_config import PAPER_RECIPE, OurFitConfig
-from brokk_min.identification.net_file import load_net, save_net
+from brokk_min.identification.net_file import load_net, save_net, select_nets
 from brokk_min.machine import BROKK_170, Machine, require
 
 
@@ -82,7 +82,7 @@ class Inspect(ReadsLogs):
     net: Path | None = None  # Also score these nets on the logs.
 
     def __call__(self, machine: Machine) -> None:
-        from brokk_min.identification import inspection, validation
+        from brokk_min.identification import inspection, validation, valve_report
 
         log, known = self.read_logs(self.logs, machine)
         reports = inspection.inspect(log)
@@ -92,6 +92,10 @@ class Inspect(ReadsLogs):
             wanted, got = f"velocity_samples {window} of --machine", net.velocity_samples
             require(got == window, str(self.net), wanted, got)
             scores = validation.score(net, logs.in_order(log, net.joints))
+            if known and (net.machine, net.rate) == (known.name, known.rate):
+                driven = select_nets(known, net)
+                learned = valve_report.from_log(known, driven, log)
+                print(*valve_report.describe(known, learned), sep="\n")
         print(f"{len(log.recordings)} recordings", *inspection.table(reports), sep="\n")
         print_scores(scores, warnings)
 

@@ -1,6 +1,7 @@
 """The commands at a machine, simulated or real, and for what was recorded there."""
 
 import logging
+import struct
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,15 @@ import numpy as np
 from tyro.conf import Positional
 
 from brokk_min import hw
+from brokk_min.actuator import ActuatorNet
+from brokk_min.beyond.adaptation import Adaptive, valves
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
 from brokk_min.can.simulated_machine import run_machine
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
-from brokk_min.evaluation.rollout import TITLES
+from brokk_min.evaluation.rollout import title
+from brokk_min.identification.valve_report import describe, load_known, save_known
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import PWM_MAX, Controller, Machine, require
 from brokk_min.shadow import Shadow
@@ -49,10 +53,16 @@ class DriveMachine(Command):
     counts: int = 12  # Its command, of 127; a little beyond the dead zone.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
     button: int = 5  # Button of the joystick that must be held.
+    adapt: bool = False  # Learn how the valves differ from those of the logs, and allow for it.
+    valves: Path | None = None  # Begin with what this JSON file knows of them, and keep it there.
     log: Path | None = None  # Also log every frame here, candump format.
 
     def __call__(self, machine: Machine) -> None:
         self.writes(self.log)
+        if self.valves and not self.valves.exists():
+            self.writes(self.valves)
+        learns = self.adapt or self.shadow
+        check(learns or not self.valves, "--valves", "--adapt or --shadow with it", self.valves)
         check(self.shadow or not self.sync, "--sync", "--shadow with it", "a drive that sends SYNC")
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         with open_bus(self.interface, self.channel, self.log) as bus:
@@ -61,21 +71,35 @@ class DriveMachine(Command):
             else:
                 drive = hw.Drive(machine, controller, bus, operator)
             drive.begin()
-            drive.run(lambda drive: print(status(drive), flush=True))
+            drive.run(show)
         if isinstance(drive, Shadow):
             print(drive.report())
+        self.keep_valves(machine, controller)
         played = not isinstance(operator, Script) or operator.done
         require(played, "drive", "to play all sequences", drive.reason or "a stop")
 
     def find_controller(self, machine: Machine) -> Controller:
         """The controller that is named."""
         if self.controller != "jog":
-            return find_controller(machine, self.policy, self.controller == "rl")
+            found, net = find_controller(machine, self.policy, self.controller == "rl")
+            if not (self.adapt or self.shadow):
+                return found
+            old = self.valves if self.valves and self.valves.exists() else None
+            known = load_known(old, machine, net) if old else None
+            return Adaptive(found, net, machine, known, self.adapt)
+        check(not self.adapt, "--adapt", "a controller that has nets", "jog")
         driven = [machine.names[i] for i in machine.driven]
         check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
         limit = machine.pwm_limit
         check(0 < self.counts <= limit, "--counts", f"1 to {limit}", self.counts)
         return JointJog(machine, self.joint, self.counts / PWM_MAX)
+
+    def keep_valves(self, machine: Machine, controller: Controller) -> None:
+        """Print what is known of the valves, and write it to `valves`."""
+        if isinstance(controller, Adaptive) and controller.known:
+            print(*describe(machine, controller.known), sep="\n")
+            if self.valves:
+                save_known(self.valves, machine, controller.net, controller.known)
 
     def find_operator(self, machine: Machine) -> Any:
         """The joystick, or the script of a file; None: a shadow follows the tool."""
@@ -87,15 +111,26 @@ class DriveMachine(Command):
         return Script(machine, np.concatenate([*goals.values()]))
 
 
-def find_controller(machine: Machine, policy: Path | None, rl: bool) -> Controller:
-    """The policy, or the PID with the gains beside it: optimised, or without a file by hand."""
+def find_controller(
+    machine: Machine, policy: Path | None, rl: bool
+) -> tuple[Controller, ActuatorNet]:
+    """The policy, or the PID with the gains beside it (or by hand without); and their nets."""
     path, gains = default_policy(machine, policy)
     found = load_policy(path, machine)
     if rl:
-        return found
+        return found, found.net
     print(f"gains of the PID: {gains or 'set by hand'}")
     pids = read_gains(gains, machine, found.net) if gains else baselines(machine, found.net)
-    return pids[OPTIMISED]
+    return pids[OPTIMISED], found.net
+
+
+def show(drive: hw.Drive) -> None:
+    """Print the status, and log what is known of the valves."""
+    print(status(drive), flush=True)
+    if isinstance(drive.controller, Adaptive) and drive.controller.known:
+        pairs = np.stack(valves(drive.controller.known), axis=-1)[0]  # (n_driven, 2, 2)
+        for i, of in zip(drive.machine.driven, pairs.reshape(len(pairs), 4)):
+            drive.bus.log_valves(int(i), struct.pack("<hhhh", *np.rint(1e4 * of).astype(int)))
 
 
 def status(drive: hw.Drive) -> str:
@@ -123,12 +158,16 @@ class Play(Command):
 
     policy: Path | None = None  # Policy that `train` wrote, with gains.json beside it.
     plant: str = "analytic"  # What moves, or FILE.py:NAME.
+    adapt: bool = False  # The controllers learn how the valves differ from those of the logs.
 
     def __call__(self, machine: Machine) -> None:
         from brokk_min.viewer.play import play
 
-        policy, pid = (find_controller(machine, self.policy, rl) for rl in (True, False))
-        controllers = {TITLES["rl"]: policy, TITLES[OPTIMISED]: pid}
+        controllers: dict[str, Controller] = {}
+        for name in ("rl", OPTIMISED):
+            found, net = find_controller(machine, self.policy, name == "rl")
+            adaptive = Adaptive(found, net, machine) if self.adapt else found
+            controllers[title(f"{name}+cold" if self.adapt else name)] = adaptive
         play(machine, controllers, find_plant(self.plant, machine))
 
 

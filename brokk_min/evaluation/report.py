@@ -19,7 +19,7 @@ from brokk_min._files import SHIPPED, whole_file
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST
 from brokk_min.evaluation.metrics import COLUMNS, Mean, Traces, interval_text
 from brokk_min.evaluation.preliminary import Curves, Gap, Tests
-from brokk_min.evaluation.rollout import TITLES, valves_at_rest
+from brokk_min.evaluation.rollout import TITLES, title, valves_at_rest
 from brokk_min.evaluation.sequences import AXES, Commands, axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170, Array, Machine
@@ -73,7 +73,7 @@ def render(results: Results, images: Mapping[str, str]) -> str:
     bound = BOUND if results["meta"]["machine"] == BROKK_170.name else None
     text = Path(__file__).with_suffix(".html.j2").read_text("utf-8")
     page: Template = Template(text, autoescape=True, undefined=StrictUndefined)
-    page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, titles=TITLES)
+    page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, title=title)
     page.globals.update(rest=valves_at_rest, interval=interval_text)
     return page.render(results=results, images=images, bound=bound, table=first_table(results))
 

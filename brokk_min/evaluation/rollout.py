@@ -22,9 +22,18 @@ TITLES = {  # of controllers in tables, figures and windows, by their names in f
 }
 
 
+def title(name: str) -> str:
+    """How tables name a controller; "+cold" and "+warm" are of `evaluation.adaptive`."""
+    plain, _, start = name.partition("+")
+    return (
+        TITLES.get(plain, plain) + {"": "", "cold": ", adaptive", "warm": ", adaptive, warm"}[start]
+    )
+
+
 def valves_at_rest(name: str) -> str:
     """The class of a controller: "closed" valves while the tool rests, or "open" ones."""
-    return "closed" if name in ("rl", "jacobian_pid_ff_integral") else "open"
+    closed = ("rl", "jacobian_pid_ff_integral")
+    return "closed" if name.partition("+")[0] in closed else "open"
 
 
 class Trace(NamedTuple):

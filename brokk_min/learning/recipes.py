@@ -24,7 +24,8 @@ def find_recipe(paper: bool = False, critic: bool = False) -> Recipe:
     elif paper:
         learner = PPOConfig(75_000_000, gamma=0.95, gae_lambda=1.0, log_std_end=-4.2)
     else:
-        learner = PPOConfig(11_000_000, gamma=0.94, gae_lambda=1.0, log_std_end=-4.0)
+        learner = PPOConfig(5_000_000, horizon=12, minibatch_size=1024, log_std_end=-4.5)
+        learner = replace(learner, gamma=0.94, gae_lambda=1.0, log_std=-2.0)
         learner = replace(learner, learning_rate=2e-3, target_kl=0.06)
     muon = not (paper or critic)
     return Recipe("paper" if paper else "beyond", critic, task, learner, muon)

@@ -9,10 +9,11 @@ from brokk_min.machine import BROKK_170
 
 
 def test_find_controller__is_the_policy_or_the_pid_with_the_gains_beside_it(folder):
-    pid = find_controller(BROKK_170, folder / "policy.npz", rl=False)
+    pid, net = find_controller(BROKK_170, folder / "policy.npz", rl=False)
     assert (pid.gains.ki == 8.0).all() and pid.k == 0.1
     (folder / "gains.json").write_text("of other nets")  # which the policy does not need
-    assert isinstance(find_controller(BROKK_170, folder / "policy.npz", rl=True), Policy)
+    policy, nets = find_controller(BROKK_170, folder / "policy.npz", rl=True)
+    assert isinstance(policy, Policy) and nets.joints == net.joints == policy.net.joints
 
 
 def test_status__says_what_stopped_it_and_what_is_in_the_way():

@@ -52,7 +52,7 @@ def test_render__begins_with_one_sentence_a_figure_and_a_table():
     assert rows[3][1:3] == ["closed", "0.0101 (0.0091 to 0.0111)"]
     assert page.index("<img") < page.index("<table") and "trial" not in rest
     last = page.split("<h2>")[-1]
-    heads = re.findall("<th>lead of (.*?) over (.*?)</th>", last)
+    heads = re.findall("<td>lead of (.*?) over (.*?)</td>", last)
     assert heads[2] == ("PPO, our interface", "strongest PID")
     leads = re.findall(r"<td>(-?\d\.\d\d)</td>", last)
     assert leads == ["0.25", "-0.50", "0.04"]  # 1 - 0.0303 / 0.0404, and so on

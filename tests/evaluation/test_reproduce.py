@@ -11,7 +11,7 @@ from helpers_cli import run
 from helpers_machines import POSE, Idle, coarse, obedient_net, one_by_one, pids, short_axes
 
 from brokk_min.actuator import cylinder_speeds, hydraulics_of
-from brokk_min.evaluation import baselines, metrics, report, reproduce
+from brokk_min.evaluation import adaptive, baselines, metrics, report, reproduce
 from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.rollout import TITLES
@@ -41,6 +41,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reproduce, "side_by_side", one_by_one)
         patch.setattr(report, "png", coarse_png)
+        patch.setattr(adaptive, "DRIVES", 2)
         reproduce.reproduce(COARSE, out, TINY, 3)
     return out
 
@@ -53,6 +54,7 @@ def results(folder):
 def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, capsys):
     """The second time by its command, as `--quick`, in several processes."""
     monkeypatch.setattr(reproduce, "QUICK", TINY)
+    monkeypatch.setattr(adaptive, "DRIVES", 2)
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
     (tmp_path / "m.py").write_text(
         "from dataclasses import replace\nfrom brokk_min.actuator import hydraulics_of\n"
@@ -113,9 +115,12 @@ def test_variations__change_what_they_say():
 
 
 def test_robustness__has_a_row_for_each_variation_and_controller():
-    pid = pids(BROKK_170, obedient_net(BROKK_170))["jacobian_pid_ff_integral"]
+    net = obedient_net(BROKK_170)
+    pid = pids(BROKK_170, net)["jacobian_pid_ff_integral"]
     task = {"idle": Idle(), "pid": pid}, short_axes(20, 2)[2:], np.tile(POSE, (2, 1)), 0
-    table = reproduce.robustness(BROKK_170, *task)
+    table = reproduce.robustness(BROKK_170, task[0], net, *task[1:])
+    kinds = [f"{name}{start}" for start in ("", "+cold", "+warm") for name in ("idle", "pid")]
+    assert sorted(table["nominal"]) == sorted(kinds)
     assert list(table) == [*reproduce.variations(BROKK_170), "goals +50 %"]
     runs, _ = metrics.evaluate(reproduce.variations(BROKK_170)["delay +50 ms"], *task)
     error = metrics.by_start(runs, "pid", "all", ERROR)

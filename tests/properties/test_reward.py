@@ -161,6 +161,6 @@ def test_cost__of_our_agent_is_of_commands_valve_travel_and_error_integral(machi
         changes = [abs(u[i, j] - before[i, j]) * 127 / machine.pwm_limit for j in machine.driven]
         squares = [(u[i, j] * 127 / machine.pwm_limit) ** 2 for j in machine.driven]
         expected = (0.1 * sum(changes) + 0.03 * sum(squares)) / len(machine.driven)
-        expected += 2.0 * math.hypot(*memory.error_integral[i])
+        expected += 3.0 * math.hypot(*memory.error_integral[i])
         np.testing.assert_allclose(found[i], expected, atol=1e-7)
     assert PAPER.cost(machine, u, before, None) == 0
