@@ -45,7 +45,7 @@ OWN, SHARED = (0.15, 0.015, 0.05, 0.005), (0.1, 0.02, 0.3, 0.05)
 NOISE = (0.03, 0.05, 0.1)  # of v in a tick: times the fastest, times w, times dw/dt (tuned)
 LIKELIER = 5.0  # ratio of log-likelihoods, from which on valves count as different (tuned)
 MEMORY, AT_REST = 20.0, 100.0  # s of a valve's motion, s of its rest, which it remembers (tuned)
-LEAST = (0.01, 0.01, 0.03)  # of the fastest, of opening, of the range to its ends: what counts
+LEAST = (0.01, 0.01, 0.03, 0.2)  # of the fastest, of opening, of the range to its ends, v / w
 SPEED, OPENING = (0.6, 1.5), 0.06  # bounds of k, and of |d|
 WIDER, PULL = 0.02, 0.1  # of full opening; of the nets' error of angle, a tick
 
@@ -109,6 +109,8 @@ def learn(
     low, high = (machine.column(name)[machine.driven] for name in ("q_min", "q_max"))
     middle = np.abs(q_now - (low + high) / 2) / (high - low) < 0.5 - LEAST[2]
     moves = middle & (np.abs(w) > LEAST[0] * fastest) & (np.abs(w) > LEAST[1] * np.abs(dw_do))
+    answers = moves & (v * w > LEAST[3] * w**2)
+    moves &= answers.any(axis=-1, keepdims=True)  # else the engine is off
     counts = np.stack([moves & (w > 0), moves & (w < 0)], axis=-1)
     weight = counts / np.square(noise).sum(axis=-1, keepdims=True)
     kept = np.exp(-machine.dt / np.where(counts, MEMORY, AT_REST))

@@ -1,6 +1,7 @@
 """Adaptation: what it learns of known valves, what it leaves alone, and the files it keeps."""
 
 import json
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -203,3 +204,21 @@ def test_cold_and_warm__begin_with_nothing_and_with_a_minute(drives):
     seconds = both["rl+warm"].known.seconds
     assert seconds.shape == (5, 4, 2) and seconds.sum() > 0
     np.testing.assert_array_equal(seconds[:2], seconds[2:4])
+
+
+def test_learn__counts_no_tick_while_nothing_moves():
+    """The engine is off, and a controller asks for motion."""
+
+    class Off:
+        def reset(self, machine, q):
+            return adaptation_state(np.array(q, float))
+
+        def step(self, machine, state, u):
+            return state
+
+    adaptation_state = namedtuple("State", "q")
+    q = np.tile([(j.q_min + j.q_max) / 2 for j in BROKK_170.joints], (2, 1))
+    goals = np.tile([0.1, 0.1, 0.1], (60, 2, 1))
+    learner = Adaptive(POLICY, NET, BROKK_170)
+    trace = rollout(BROKK_170, learner, q, goals, 0.05, np.random.default_rng(0), Off())
+    assert np.abs(trace.u).max() > 0.3 and learner.known.seconds.max() < 0.2

@@ -6,7 +6,7 @@ import pytest
 from helpers_cli import run
 from helpers_machines import obedient_net, pids
 
-from brokk_min.evaluation import baselines
+from brokk_min.evaluation import adaptive, baselines
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.learning.policy import POLICIES
 from brokk_min.machine import BROKK_170
@@ -68,3 +68,13 @@ def test_reproduce__does_not_write_over_results(tmp_path, capsys):
     assert run(f"reproduce --quick --out {tmp_path}") == 2
     assert "results.json: expected no file (or --force), got one" in capsys.readouterr().err
     assert (tmp_path / "results.json").read_text() == "{}"
+
+
+def test_evaluate__adapts_each_controller_cold_and_warm(folder, capsys, monkeypatch):
+    monkeypatch.setattr(adaptive, "DRIVES", 2)
+    monkeypatch.setattr(adaptive, "PARTS", 1)
+    assert evaluate(folder, "--adapt") == 0
+    printed = capsys.readouterr().out
+    for name in ("rl", *pids(BROKK_170, NET)):
+        assert f"\n{TITLES[name]}, adaptive " in printed
+        assert f"\n{TITLES[name]}, adaptive, warm " in printed

@@ -1,9 +1,15 @@
 """The commands at a machine: their controllers, and the line that they print."""
 
+import struct
+
+import numpy as np
+import pytest
 from helpers_bus import BASELINE, HoldingOperator, Virtual, World, only
 
+from brokk_min.beyond.adaptation import valves
+from brokk_min.can.drive_log import read_frames
 from brokk_min.can.operator_input import Joystick
-from brokk_min.cli.operating import find_controller, status
+from brokk_min.cli.operating import DriveMachine, find_controller, show, status
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import BROKK_170
 
@@ -40,3 +46,30 @@ def test_status__names_the_axis_of_a_stick_that_is_not_centred():
         world.drive
     )
     device.unplug()
+
+
+def test_drive_adapt__learns_on_the_bus_logs_keeps_and_begins_with_what_it_knew(tmp_path, capsys):
+    kept, log = tmp_path / "valves.json", tmp_path / "run.log"
+    command = DriveMachine(interface="virtual", channel="v", adapt=True, valves=kept)
+    controller = command.find_controller(BROKK_170)
+    assert controller.known is None and controller.applies
+    world = World(controller, HoldingOperator(), log=log)
+    world.drive.begin()
+    world.run(5.0)
+    show(world.drive)
+    command.keep_valves(BROKK_170, controller)
+    printed = capsys.readouterr().out
+    assert "driving" in printed and " s of motion" in printed
+    world.drive.bus.flush()
+    frames = {f.id: f.data for f in read_frames(log) if 0x7F0 <= f.id < 0x7FE}
+    assert set(frames) == {0x7F0 + i for i in BROKK_170.driven}
+    k, d = (of[0] for of in valves(controller.known))
+    logged = np.array([struct.unpack("<hhhh", frames[key]) for key in sorted(frames)]) / 1e4
+    np.testing.assert_allclose(logged, np.stack([k, d], axis=-1).reshape(-1, 4), atol=1e-4)
+    again = command.find_controller(BROKK_170).known
+    assert again.seconds.sum() == pytest.approx(controller.known.seconds.sum())
+    assert again.seconds.sum() > 1.0
+    shadow = DriveMachine(interface="virtual", channel="v", shadow=True)
+    assert not shadow.find_controller(BROKK_170).applies
+    plain = DriveMachine(interface="virtual", channel="v").find_controller(BROKK_170)
+    assert isinstance(plain, Policy)
