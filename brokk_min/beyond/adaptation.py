@@ -13,8 +13,8 @@ better than the logs do. The opening o that the controller asks for becomes o / 
 history it sees the commands that would have done the same to the valves of its logs.
 
 What it buys (`python -m benchmarks.adaptation`): with valves 20 % slower our agent's error is
-0.0122 m/s and not 0.0210 m/s, and after a minute 0.0115 m/s; where a controller knows its valves it
-is 0.0114 m/s. Where nothing is wrong nothing changes.
+0.0123 m/s and not 0.0210 m/s, and after a minute 0.0114 m/s, which is that of a controller that
+knows its valves. Where nothing is wrong nothing changes.
 
 Who was first: self-tuning regulators (Astrom and Wittenmark, 1973); Jensen et al. (2020) adapt two
 states a valve on a loader crane; openpilot's torqued learns a car's steering within bounds; James
