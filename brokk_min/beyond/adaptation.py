@@ -9,7 +9,8 @@ moves (S: sum of |w| / fastest of each joint), short of oil by c, has
 
 Least squares give these four for each joint and direction. What a valve has not shown yet it takes
 from the mean of all, because cold oil slows them alike. All count only as far as they explain v
-better than the logs do. The opening o that the controller asks for becomes o / k - d, and in its
+better than the logs do: by the factor 1 - 5 / R, where R is twice the logarithm of the ratio of
+likelihoods. The opening o that the controller asks for becomes o / k - d, and in its
 history it sees the commands that would have done the same to the valves of its logs.
 
 What it buys (`python -m benchmarks.adaptation`): with valves 20 % slower our agent's error is
@@ -42,12 +43,13 @@ from brokk_min.machine import (
 
 # Of k - 1, k d, c and tau [s], assumed: how far valves differ from their mean, and that from 0.
 OWN, SHARED = (0.15, 0.015, 0.05, 0.005), (0.1, 0.02, 0.3, 0.05)
-NOISE = (0.03, 0.05, 0.1)  # of v in a tick: times the fastest, times w, times dw/dt (tuned)
-LIKELIER = 5.0  # ratio of log-likelihoods, from which on valves count as different (tuned)
+NOISE = (0.0067, 0.0112, 0.0224)  # of v within 1 s: times the fastest, w, dw/dt (tuned)
+LIKELIER = 5.0  # twice a log of likelihoods' ratio, from which valves are other ones (tuned)
 MEMORY, AT_REST = 20.0, 100.0  # s of a valve's motion, s of its rest, which it remembers (tuned)
-LEAST = (0.01, 0.01, 0.03, 0.2)  # of the fastest, of opening, of the range to its ends, v / w
+LEAST = (0.01, 0.01, 0.03)  # of the fastest, of opening, of the range to its ends
+ANSWER = (0.2, 0.03)  # of w and of the fastest: more than the noise of a joint that stands
 SPEED, OPENING = (0.6, 1.5), 0.06  # bounds of k, and of |d|
-WIDER, PULL = 0.02, 0.1  # of full opening; of the nets' error of angle, a tick
+WIDER, FOLLOWS = 0.02, 0.5  # of full opening; s, in which the nets follow measured angles
 
 
 class Known(NamedTuple):
@@ -55,7 +57,7 @@ class Known(NamedTuple):
 
     A: Array  # of f f^T / noise^2, (..., 4, 4)
     b: Array  # of f (v - w) / noise^2, (..., 4)
-    seconds: Array  # of its motion
+    seconds: Array  # of its motion that it remembers
 
 
 def valves(known: Known) -> tuple[Array, Array]:
@@ -69,7 +71,7 @@ def valves(known: Known) -> tuple[Array, Array]:
     of_m = np.diag(np.power(SHARED, -2.0)) + (P - P @ inverse @ P).sum(axis=(-4, -3))
     m = np.linalg.solve(of_m, (P @ inverse @ b).sum(axis=(-4, -3)))
     x = inverse @ (b + P @ m[..., None, None, :, :])
-    ratio = (x * (2 * b - A @ x)).sum(axis=(-4, -3, -2, -1), keepdims=True)  # of likelihoods, log
+    ratio = (x * (2 * b - A @ x)).sum(axis=(-4, -3, -2, -1), keepdims=True)  # its log, twice
     x = x[..., 0] * np.maximum(0, 1 - LIKELIER / np.maximum(ratio[..., 0], 1e-9))
     k = np.clip(1 + x[..., 0], *SPEED)
     return k, np.clip(x[..., 1] / k, -OPENING, OPENING)
@@ -98,7 +100,7 @@ def learn(
     u = np.stack([sent, valve_command(opening + WIDER * np.sign(opening), zones)])
     q = runs[..., 0, -1] + machine.dt * net.predict(append_command(runs, u))
     runs = append_sample(runs, u, q, machine.velocity_samples, machine.dt)
-    runs[..., 0, :] += PULL * (q_now - q)[..., None]
+    runs[..., 0, :] += machine.dt / FOLLOWS * (q_now - q)[..., None]
 
     w, w_wider = runs[..., 1, -1]
     dw_do, dw_dt = (w_wider - w) / WIDER, (w - runs[0, ..., 1, -2]) / machine.dt
@@ -109,18 +111,21 @@ def learn(
     low, high = (machine.column(name)[machine.driven] for name in ("q_min", "q_max"))
     middle = np.abs(q_now - (low + high) / 2) / (high - low) < 0.5 - LEAST[2]
     moves = middle & (np.abs(w) > LEAST[0] * fastest) & (np.abs(w) > LEAST[1] * np.abs(dw_do))
-    answers = moves & (v * w > LEAST[3] * w**2)
+    answers = moves & (v * np.sign(w) > np.maximum(ANSWER[0] * np.abs(w), ANSWER[1] * fastest))
     moves &= answers.any(axis=-1, keepdims=True)  # else the engine is off
     counts = np.stack([moves & (w > 0), moves & (w < 0)], axis=-1)
-    weight = counts / np.square(noise).sum(axis=-1, keepdims=True)
+    weight = machine.dt * counts / np.square(noise).sum(axis=-1, keepdims=True)
     kept = np.exp(-machine.dt / np.where(counts, MEMORY, AT_REST))
     A = kept[..., None, None] * known.A + weight[..., None, None] * f[..., None] * f[..., None, :]
     b = kept[..., None] * known.b + weight[..., None] * f * (v - w)[..., None, None]
-    return Known(A, b, known.seconds + machine.dt * counts), runs
+    return Known(A, b, kept * known.seconds + machine.dt * counts), runs
 
 
 def adapt(u: Array, zones: Array, k: Array, d: Array, inverse: bool = False) -> Array:
-    """Commands (...) that do to these valves what `u` does to those of the logs, or inversely."""
+    """Commands (...) that do to these valves what `u` does to those of the logs, or inversely.
+
+    Below the dead zone they are scaled, so that both dead zones end at the same `u`.
+    """
     zone, k, d = (by_direction(u, pairs) for pairs in (zones, k, d))
     begins = np.maximum(zone - (1 - zone) * d, 0)  # to open
     before, after, gain = (begins, zone, k) if inverse else (zone, begins, 1 / k)

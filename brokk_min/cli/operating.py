@@ -63,6 +63,8 @@ class DriveMachine(Command):
             self.writes(self.valves)
         learns = self.adapt or self.shadow
         check(learns or not self.valves, "--valves", "--adapt or --shadow with it", self.valves)
+        nets = self.controller != "jog" or not (self.adapt or self.valves)
+        check(nets, "--adapt, --valves", "a controller that has nets", "jog")
         check(self.shadow or not self.sync, "--sync", "--shadow with it", "a drive that sends SYNC")
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         with open_bus(self.interface, self.channel, self.log) as bus:
@@ -70,11 +72,13 @@ class DriveMachine(Command):
                 drive: hw.Drive = Shadow(machine, controller, bus, operator, self.sync)
             else:
                 drive = hw.Drive(machine, controller, bus, operator)
-            drive.begin()
-            drive.run(show)
+            try:
+                drive.begin()
+                drive.run(show)
+            finally:
+                self.keep_valves(machine, controller)
         if isinstance(drive, Shadow):
             print(drive.report())
-        self.keep_valves(machine, controller)
         played = not isinstance(operator, Script) or operator.done
         require(played, "drive", "to play all sequences", drive.reason or "a stop")
 
@@ -87,7 +91,6 @@ class DriveMachine(Command):
             old = self.valves if self.valves and self.valves.exists() else None
             known = load_known(old, machine, net) if old else None
             return Adaptive(found, net, machine, known, self.adapt)
-        check(not self.adapt, "--adapt", "a controller that has nets", "jog")
         driven = [machine.names[i] for i in machine.driven]
         check(self.joint in driven, "--joint", f"one of {driven}", self.joint)
         limit = machine.pwm_limit
@@ -97,7 +100,8 @@ class DriveMachine(Command):
     def keep_valves(self, machine: Machine, controller: Controller) -> None:
         """Print what is known of the valves, and write it to `valves`."""
         if isinstance(controller, Adaptive) and controller.known:
-            print(*describe(machine, controller.known), sep="\n")
+            for line in describe(machine, controller.known):
+                print(line)
             if self.valves:
                 save_known(self.valves, machine, controller.net, controller.known)
 
@@ -130,7 +134,8 @@ def show(drive: hw.Drive) -> None:
     if isinstance(drive.controller, Adaptive) and drive.controller.known:
         pairs = np.stack(valves(drive.controller.known), axis=-1)[0]  # (n_driven, 2, 2)
         for i, of in zip(drive.machine.driven, pairs.reshape(len(pairs), 4)):
-            drive.bus.log_valves(int(i), struct.pack("<hhhh", *np.rint(1e4 * of).astype(int)))
+            packed = struct.pack("<hhhh", *np.rint(1e4 * of).astype(int))
+            drive.attempt(drive.bus.log_valves, int(i), packed)
 
 
 def status(drive: hw.Drive) -> str:

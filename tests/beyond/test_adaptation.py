@@ -1,7 +1,6 @@
 """Adaptation: what it learns of known valves, what it leaves alone, and the files it keeps."""
 
 import json
-from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -9,15 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brokk_min._files import SHIPPED
+from brokk_min.actuator import PLANT
 from brokk_min.beyond import adaptation
 from brokk_min.beyond.adaptation import Adaptive, Known, adapt, unknown, valves
 from brokk_min.evaluation import adaptive, sequences
 from brokk_min.evaluation.reproduce import variations
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.identification.validation import task_log
-from brokk_min.identification.valve_report import describe, from_log, load_known, save_known
+from brokk_min.identification.valve_report import KEPT, describe, from_log, load_known, save_known
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, valve_opening
+from brokk_min.settings import TaskConfig
 from tests.helpers_machines import Idle
 
 POLICY = load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170)
@@ -64,7 +65,7 @@ def test_adaptive__learns_speed_and_opening_of_each_valve_and_needs_less(name, k
 @pytest.mark.parametrize("name", ["nominal", "delay +50 ms", "supply flow -70 %"])
 def test_adaptive__changes_nothing_where_the_valves_are_those_of_the_logs(name, drives):
     learner, error = driven(VARIED[name], drives)
-    assert error == pytest.approx(plain(VARIED[name], drives), rel=0.015)
+    assert error == pytest.approx(plain(VARIED[name], drives), rel=0.012)
     assert abs(valves(learner.known)[0] - 1).mean() < 0.03
 
 
@@ -159,16 +160,17 @@ def test_known__is_kept_in_a_file_of_this_machine_and_these_nets(tmp_path, drive
     path, one = tmp_path / "valves.json", Known(*(of[:1] for of in learner.known))
     save_known(path, BROKK_170, NET, one)
     for kept, of in zip(load_known(path, BROKK_170, NET), one, strict=True):
-        np.testing.assert_array_equal(kept, of)
+        np.testing.assert_allclose(kept, KEPT * of)
     good = json.loads(path.read_text())
     bad = {
         "nets": "other",
         "machine": "other",
         "seconds": [[0.0, 1.0]],
         "b": np.full((4, 2, 4), np.nan).tolist(),
-        "A": (-np.tile(np.eye(4), (4, 2, 1, 1))).tolist(),
+        "A": (-1e3 * np.tile(np.eye(4), (4, 2, 1, 1))).tolist(),
     }
-    for key, value in bad.items():
+    lopsided = np.tile(np.triu(np.full((4, 4), 9.0)), (4, 2, 1, 1)).tolist()
+    for key, value in [*bad.items(), ("A", lopsided), ("b", np.full((4, 2, 4), 1e300).tolist())]:
         path.write_text(json.dumps(good | {key: value}))
         with pytest.raises(ValueError, match=r"valves\.json"):
             load_known(path, BROKK_170, NET)
@@ -189,9 +191,10 @@ def test_from_log__finds_the_same_in_recordings():
         recordings=[one._replace(u=one.u[:50], q=one.q[:50]) for one in log.recordings]
     )
     mixed = log._replace(recordings=[log.recordings[0], *short.recordings[1:]])
-    alone = from_log(BROKK_170, NET, log._replace(recordings=log.recordings[:1])).seconds
-    rest = from_log(BROKK_170, NET, short._replace(recordings=short.recordings[1:])).seconds
-    np.testing.assert_allclose(from_log(BROKK_170, NET, mixed).seconds, alone + rest)
+    rest = from_log(BROKK_170, NET, short._replace(recordings=short.recordings[1:])).A
+    alone = from_log(BROKK_170, NET, log._replace(recordings=log.recordings[:1])).A
+    # float32 nets of one run or of eight round otherwise
+    np.testing.assert_allclose(from_log(BROKK_170, NET, mixed).A, alone + rest, rtol=1e-3, atol=1)
 
 
 def test_cold_and_warm__begin_with_nothing_and_with_a_minute(drives):
@@ -206,19 +209,28 @@ def test_cold_and_warm__begin_with_nothing_and_with_a_minute(drives):
     np.testing.assert_array_equal(seconds[:2], seconds[2:4])
 
 
-def test_learn__counts_no_tick_while_nothing_moves():
-    """The engine is off, and a controller asks for motion."""
+class Off:
+    """The plant of an engine that goes off after some ticks."""
 
-    class Off:
-        def reset(self, machine, q):
-            return adaptation_state(np.array(q, float))
+    def __init__(self, ticks):
+        self.ticks = ticks
 
-        def step(self, machine, state, u):
-            return state
+    def reset(self, machine, q):
+        return PLANT.reset(machine, q)
 
-    adaptation_state = namedtuple("State", "q")
-    q = np.tile([(j.q_min + j.q_max) / 2 for j in BROKK_170.joints], (2, 1))
-    goals = np.tile([0.1, 0.1, 0.1], (60, 2, 1))
-    learner = Adaptive(POLICY, NET, BROKK_170)
-    trace = rollout(BROKK_170, learner, q, goals, 0.05, np.random.default_rng(0), Off())
-    assert np.abs(trace.u).max() > 0.3 and learner.known.seconds.max() < 0.2
+    def step(self, machine, state, u):
+        self.ticks -= 1
+        return PLANT.step(machine, state, u) if self.ticks >= 0 else state
+
+
+@pytest.mark.parametrize("ticks", [0, 200])
+def test_learn__counts_hardly_a_tick_once_the_engine_is_off(ticks, drives):
+    start, goals = drives
+    off, on = (Adaptive(POLICY, NET, BROKK_170, unknown((8, 4))) for _ in range(2))
+    rng = np.random.default_rng
+    trace = rollout(BROKK_170, off, *drives, TaskConfig.noise, rng(0), Off(ticks))
+    assert np.abs(trace.u[ticks:]).max() > 0.3
+    if ticks:
+        rollout(BROKK_170, on, start, goals[:ticks], TaskConfig.noise, rng(0))
+    assert off.known.seconds.max() <= on.known.seconds.max() + 0.05
+    assert valves(off.known)[0].min() > 0.85
