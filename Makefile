@@ -43,11 +43,12 @@ docs: .venv/installed-dev
 	"$(PYTHON)" -m venv .venv
 
 .venv/installed: pyproject.toml constraints.txt | .venv/bin/python
-	$(RUN) pip install --quiet -c constraints.txt -e .
+	$(RUN) pip install --quiet -c constraints.txt -e ".[train]"
 	touch .venv/installed
 
 .venv/installed-dev: pyproject.toml constraints.txt | .venv/bin/python
-	$(RUN) pip install --quiet -c constraints.txt -e ".[dev]"
+	$(RUN) pip install --quiet -c constraints.txt pip  # that of Python 3.11 knows no --group
+	$(RUN) pip install --quiet -c constraints.txt -e ".[all]" --group dev
 	touch .venv/installed .venv/installed-dev
 
 clean:

@@ -24,11 +24,12 @@ SHIPPED = Path(__file__).parent / "shipped"
 
 
 def require_package(package: str, extra: str) -> Any:
-    """Import a package of an extra of pyproject.toml; ValueError: it is not installed."""
+    """Import a package of an extra of pyproject.toml; ValueError: how to install it."""
     try:
         return import_module(package)
     except ImportError as error:
-        raise ValueError(f"{package}: expected brokk_min[{extra}], got {error}") from error
+        wanted = f"pip install -c constraints.txt -e '.[{extra}]'"
+        raise ValueError(f"{package}: expected {wanted}, got {error}") from error
 
 
 @contextmanager

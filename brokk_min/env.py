@@ -51,6 +51,11 @@ def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
     Poses and speeds are drawn as in training, directions anywhere. The joint velocities are
     the smallest that give the goal, pinv(J) v, cut at each joint's nominal speed, and at least 5 %
     of that speed.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> velocity_deviations(BROKK_170)[0].round(3).tolist()
+        [0.093, 0.093, 0.093]
     """
     rng = np.random.default_rng(0)
     q = rng.uniform(machine.column("q_min"), machine.column("q_max"), (DRAWS, machine.n))
@@ -74,7 +79,13 @@ class Scale(NamedTuple):
 
 @lru_cache
 def observation_table(machine: Machine) -> Scale:
-    """The table above in numbers; angles are uniform over their range. Paper: Sec. 3.4"""
+    """The table above in numbers; angles are uniform over their range. Paper: Sec. 3.4
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> observation_table(BROKK_170).mean.shape
+        (163,)
+    """
     H = machine.history
     q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
     q_std = (machine.column("q_max") - machine.column("q_min")) / 12**0.5
@@ -97,6 +108,12 @@ def measure(
     noisy) is in deviations and is added to what sensors measure. It is new at each tick for all
     samples of the history, old ones too. The tool's velocity has noise of its own beside that of
     the angles in J.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
+        >>> measure(BROKK_170, state.history, state.v_goal).history.shape  # of driven joints
+        (4, 3, 13)
     """
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
@@ -112,7 +129,14 @@ def measure(
 
 
 def features(machine: Machine, measured: Measured) -> Array:
-    """The observation of the table above. Paper: Sec. 3.4, Fig. 3"""
+    """The observation of the table above. Paper: Sec. 3.4, Fig. 3
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
+        >>> features(BROKK_170, measure(BROKK_170, state.history, state.v_goal)).shape
+        (163,)
+    """
     shape = (*measured.q.shape[:-1], -1)
     angles_and_velocities = measured.history[..., :2, :].reshape(shape)
     u = measured.history[..., 2, :].reshape(shape)
@@ -187,7 +211,13 @@ class State(NamedTuple):
 
 
 def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: Plant = PLANT) -> State:
-    """Machines at rest at angles `q` [rad] (..., n) with goals (..., 3) [m/s] that never change."""
+    """Machines at rest at angles `q` [rad] (..., n) with goals (..., 3) [m/s] that never change.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> initial_state(BROKK_170, np.zeros((256, 5)), [0.1, 0, 0]).v_goal.shape
+        (256, 3)
+    """
     q = np.array(q, float)
     goal = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
     measured = read_encoder(machine, q).astype(np.float32)
@@ -205,7 +235,14 @@ def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: Plan
 
 
 def transition(machine: Machine, plant: Plant, state: State, u: Array) -> State:
-    """One tick of the plant under the command `u` (..., n). Paper: Sec. 3.4"""
+    """One tick of the plant under the command `u` (..., n). Paper: Sec. 3.4
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
+        >>> float(transition(BROKK_170, PLANT, state, np.zeros(5)).v_tool.max())  # at rest
+        0.0
+    """
     after = plant.step(machine, state.plant, u)
     q = np.asarray(after.q, float)
     q_dot = (q - state.q) / machine.dt
@@ -224,12 +261,23 @@ def transition(machine: Machine, plant: Plant, state: State, u: Array) -> State:
 
 
 def reward(v_goal: Array, v_tool: Array) -> Array:
-    """1 / (1 + |v_goal - v_tool|) (...) of velocities [m/s] (..., 3), in (0, 1]. Paper: eq2"""
+    """1 / (1 + |v_goal - v_tool|) (...) of velocities [m/s] (..., 3), in (0, 1]. Paper: eq2
+
+    Example:
+        >>> reward(np.array([0.2, 0.0, 0.0]), np.array([0.2, 0.0, 0.25])).tolist()
+        0.8
+    """
     return np.asarray(1 / (1 + np.linalg.norm(v_goal - v_tool, axis=-1)))
 
 
 def terminated(machine: Machine, lowest: Array) -> Bools:
-    """Is a link in the ground? `lowest` [m] (...) is `kinematics.lowest_point`. Paper: Sec. 3.4"""
+    """Is a link in the ground? `lowest` [m] (...) is `kinematics.lowest_point`. Paper: Sec. 3.4
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> terminated(BROKK_170, np.array([0.1, -0.1])).tolist()
+        [False, True]
+    """
     return np.asarray(lowest < machine.ground)
 
 
@@ -237,12 +285,25 @@ def terminated(machine: Machine, lowest: Array) -> Bools:
 
 
 def draw_pose(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
-    """Random angles within the joints' ranges [rad] (num, n); some have a link in the ground."""
+    """Random angles within the joints' ranges [rad] (num, n); some have a link in the ground.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> draw_pose(BROKK_170, TaskConfig(), np.random.default_rng(0), 256).shape
+        (256, 5)
+    """
     return rng.uniform(machine.column("q_min"), machine.column("q_max"), (num, machine.n))
 
 
 def draw_goal(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
-    """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed."""
+    """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> goals = draw_goal(BROKK_170, TaskConfig(), np.random.default_rng(0), 256)
+        >>> bool(np.linalg.norm(goals, axis=-1).max() <= 0.3)
+        True
+    """
     direction = rng.standard_normal((num, 3))
     kind = rng.random((num, 1))
     axis = DIRECTIONS[rng.integers(0, 6, num)]
@@ -252,14 +313,27 @@ def draw_goal(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array
 
 
 def draw_hold(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> NDArray[np.int64]:
-    """Random numbers of ticks for which a goal holds, (num,)."""
+    """Random numbers of ticks for which a goal holds, (num,).
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> hold = draw_hold(BROKK_170, TaskConfig(), np.random.default_rng(0), 256)
+        >>> bool((hold >= 40).all() and (hold <= 120).all())  # 2 to 6 s
+        True
+    """
     low = max(1, round(config.hold_min_s * machine.rate))
     high = max(1, round(config.hold_max_s * machine.rate))
     return rng.integers(low, high + 1, num)
 
 
 def draw_noise(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
-    """Uniform noise of `measure` [deviations], float32 (num, noisy). Paper: Sec. 3.4 (5 %)"""
+    """Uniform noise of `measure` [deviations], float32 (num, noisy). Paper: Sec. 3.4 (5 %)
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> draw_noise(BROKK_170, TaskConfig(), np.random.default_rng(0), 256).shape
+        (256, 108)
+    """
     size = observation_table(machine).measured.sum()
     return np.float32(config.noise) * (2 * rng.random((num, size), np.float32) - 1)
 
@@ -298,7 +372,14 @@ class Task:
 
 
 def reset(task: Task, rng: Rng, num: int) -> Episodes:
-    """`num` machines at rest in random poses, with random goals. Paper: Sec. 3.4"""
+    """`num` machines at rest in random poses, with random goals. Paper: Sec. 3.4
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> task = Task(BROKK_170, PLANT, TaskConfig(), PAPER)
+        >>> reset(task, np.random.default_rng(0), 256).obs.shape
+        (256, 163)
+    """
     pose, goal, hold = (task.draw(what, rng, num) for what in (draw_pose, draw_goal, draw_hold))
     state = initial_state(task.machine, pose, goal, task.plant)._replace(goal_ticks=hold)
     return look(task, rng, state, None)
@@ -348,6 +429,13 @@ def step(
     """A `tick`, then new episodes where some have ended: same-step resets. Paper: Fig. 4
 
     Their own last observations are in the dictionary as `final_obs`.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> rng, task = np.random.default_rng(0), Task(BROKK_170, PLANT, TaskConfig(), PAPER)
+        >>> _, earned, *_ = step(task, rng, reset(task, rng, 256), np.zeros((256, 4)))
+        >>> earned.shape, bool(earned.max() <= 1)
+        ((256,), True)
     """
     after, earned, end, truncated, info = tick(task, rng, before, actions)
     if (ended := end | truncated).any():
@@ -370,7 +458,12 @@ def restart(task: Task, rng: Rng, episodes: Episodes, ended: Bools) -> Episodes:
 
 
 def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
-    """`function` of all arrays in `Episodes`, their `State`, the plant's state, and the memory."""
+    """`function` of all arrays in `Episodes`, their `State`, the plant's state, and the memory.
+
+    Example:
+        >>> map_arrays(lambda x: x[0], (np.array([1, 2]), None))
+        (np.int64(1), None)
+    """
     if first is None:
         return None
     if isinstance(first, tuple):

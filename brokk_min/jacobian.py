@@ -28,6 +28,11 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
         W: diagonal of the weight matrix, (..., n), positive.
         damping: lambda^2 [m^2], (...); must be positive where J W^-1 J^T is singular.
         as_printed: use the paper's printed form.
+
+    Example:
+        >>> J_inv = dls(np.eye(3), np.ones(3), 1.0)
+        >>> J_inv.diagonal().tolist()  # 1 / (1 + lambda^2)
+        [0.5, 0.5, 0.5]
     """
     J, W = np.asarray(J, float), np.asarray(W, float)
     W_inv = 1 / W[..., None, :]
@@ -41,6 +46,12 @@ def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
     """Gradient [1/rad] of Chan and Dubey's (1995) joint-limit function at angles `q`, (..., n).
 
     h(q) = sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> middle = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
+        >>> bool(np.allclose(limit_gradient(BROKK_170, middle), 0))
+        True
     """
     low, high = machine.column("q_min"), machine.column("q_max")
     margin = 1e-3 * (high - low)  # finite at the limits and beyond
@@ -54,13 +65,24 @@ def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
     """Diagonal of W for all joints, (..., n): 1 + |dh/dq| towards a limit, otherwise 1.
 
     `q` are angles [rad], `q_dot` velocities whose sign gives the direction. Paper: Sec. 4.2 (W)
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> q = [0.0, 0.7, 1.5, 1.75, 1.0]  # q3 is near its upper limit
+        >>> limit_weights(BROKK_170, q, [0, 0, 1, 0, 0]).round(1)
+        array([ 1. ,  1. , 48.4,  1. ,  1. ])
     """
     gradient = limit_gradient(machine, q)
     return np.where(gradient * np.asarray(q_dot) > 0, 1 + np.abs(gradient), 1.0)
 
 
 def manipulability(J: ArrayLike) -> Array:
-    """w = sqrt(det(J J^T)) [m^3] of Jacobians (..., 3, n), (...); 0: singular. Yoshikawa (1985)"""
+    """w = sqrt(det(J J^T)) [m^3] of Jacobians (..., 3, n), (...); 0: singular. Yoshikawa (1985)
+
+    Example:
+        >>> manipulability(np.diag([1.0, 2.0, 3.0])).round(6).tolist()
+        6.0
+    """
     J = np.asarray(J)
     return np.asarray(np.sqrt(np.maximum(np.linalg.det(J @ np.swapaxes(J, -1, -2)), 0.0)))
 
@@ -77,7 +99,13 @@ def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
 
 @lru_cache
 def manipulability_threshold(machine: Machine) -> float:
-    """w0: a quarter of the largest manipulability over 2,000 random poses (assumed)."""
+    """w0: a quarter of the largest manipulability over 2,000 random poses (assumed).
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> round(manipulability_threshold(BROKK_170), 2)  # m^3
+        3.9
+    """
     low, high = machine.column("q_min"), machine.column("q_max")
     poses = np.random.default_rng(0).uniform(low, high, (2000, machine.n))
     J = jacobian(forward_kinematics(machine, poses))[..., machine.driven]
@@ -107,6 +135,12 @@ def pid(gains: Gains, error: Array, state: PIDState, dt: float) -> tuple[Array, 
     """Valve openings (..., n_driven) for velocity errors [rad/s], and the state of the next tick.
 
     x = kp e + ki integral(e) + kd d, where the derivative is filtered: T d' + d = de/dt.
+
+    Example:
+        >>> one = np.ones(1)
+        >>> state = PIDState(0 * one, one, 0 * one, one)
+        >>> pid(Gains(2 * one, one, 0 * one, one), one, state, 0.05)[0].tolist()
+        [2.0]
     """
     T = DERIVATIVE_TIME
     keep, take = T / (T + dt), dt / (T + dt)

@@ -35,6 +35,11 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
     theta_i + q_i for theta_i of a revolute joint and d_i + q_i for d_i of a prismatic one.
 
     ValueError: `q` has another number of joints.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> forward_kinematics(BROKK_170, np.zeros((256, 5))).p.shape
+        (256, 6, 3)
     """
     q = 1.0 * np.asarray(q)  # whole numbers become floats
     if q.shape[-1:] != (machine.n,):
@@ -58,12 +63,24 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
 
 
 def rotate(a: Array, b: Array, c: Array | float, s: Array | float) -> tuple[Array, Array]:
-    """The vectors `a` and `b`, turned in their plane by an angle with cosine `c` and sine `s`."""
+    """The vectors `a` and `b`, turned in their plane by an angle with cosine `c` and sine `s`.
+
+    Example:
+        >>> rotate(np.array([1, 0]), np.array([0, 1]), 0, 1)  # a quarter turn
+        (array([0, 1]), array([-1,  0]))
+    """
     return c * a + s * b, c * b - s * a
 
 
 def tool_position(frames: Frames) -> Array:
-    """Position p_n of the tool tip in the base frame [m], (..., 3)."""
+    """Position p_n of the tool tip in the base frame [m], (..., 3).
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> q = [0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4]  # the arm straight and level
+        >>> tool_position(forward_kinematics(BROKK_170, q)).round(2) + 0.0
+        array([5.  , 0.  , 0.95])
+    """
     return frames.p[..., -1, :]
 
 
@@ -71,6 +88,12 @@ def jacobian(frames: Frames) -> Array:
     """Derivative of the tool position by all joints [m/rad or 1], (..., 3, n). Paper: eq3 (J)
 
     J_i = z_{i-1} x (p_n - p_{i-1}), i = 1 .. n; J_i = z_{i-1} of a prismatic joint.
+
+    Example:
+        >>> from brokk_min.machine import BROKK_170
+        >>> J = jacobian(forward_kinematics(BROKK_170, np.zeros((256, 5))))
+        >>> J.shape, J[0, 1, 0].round(2).tolist()  # the slew moves the tool along y
+        ((256, 3, 5), 2.35)
     """
     J = np.cross(frames.z[..., :-1, :], frames.p[..., -1:, :] - frames.p[..., :-1, :])
     for i in frames.prismatic:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from brokk_min._files import write_json
+from brokk_min._files import require_package, write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.can.operator_input import read_commands
 from brokk_min.cli.options import Command, check, default_policy, find_plant
@@ -103,6 +103,7 @@ class Reproduce(Command):
     seed: int = 0  # Of everything that is random.
 
     def __call__(self, machine: Machine) -> None:
+        require_package("torch", "train")
         from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce  # loads torch
 
         check(self.seed >= 0, "--seed", "0 or more", self.seed)

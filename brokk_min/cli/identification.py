@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
-from brokk_min._files import expected, write_json
+from brokk_min._files import expected, require_package, write_json
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.can.drive_log import log_for_fit, read_frames
 from brokk_min.cli.options import Command, check, check_settings, find_plant
@@ -119,6 +119,7 @@ class Fit(ReadsLogs):
         return cls(logs=required, out=required, settings=OurFitConfig(**recipe))
 
     def __call__(self, machine: Machine) -> None:
+        require_package("torch", "train")
         from brokk_min.identification import fitting, inspection, validation
 
         settings = self.settings

@@ -11,6 +11,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from brokk_min import hw
+from brokk_min._files import require_package
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.adaptation import Adaptive, valves
 from brokk_min.can.connection import open_bus
@@ -199,6 +200,7 @@ class Export(Command):
     out: Path  # File to write, .onnx.
 
     def __call__(self, machine: Machine) -> None:
+        require_package("onnxscript", "export")
         from brokk_min.learning.onnx import export_onnx
 
         self.writes(self.out)

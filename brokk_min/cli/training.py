@@ -7,6 +7,7 @@ from typing import Any
 import tyro
 from tyro.conf import OmitArgPrefixes
 
+from brokk_min._files import require_package
 from brokk_min.cli.options import Command, check, check_settings
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.recipes import Recipe, find_recipe
@@ -35,6 +36,7 @@ class Training(Command):
 
     def recipe(self) -> Recipe:
         """The agent, its learner and its task."""
+        require_package("torch", "train")
         check(self.seed >= 0, "--seed", "0 or more", self.seed)
         learner, task = self.learner, self.task
         check_settings(learner)
@@ -52,9 +54,9 @@ class Train(Training):
     resume: bool = False  # Go on from OUT.checkpoint; the end is the same as without the break.
 
     def __call__(self, machine: Machine) -> None:
+        recipe = self.recipe()
         from brokk_min.learning.checkpoint import train_policy
 
-        recipe = self.recipe()
         self.writes(self.out)
         fits = self.resume or not Path(f"{self.out}.checkpoint").exists()
         check(fits, f"{self.out}.checkpoint", "--resume or no checkpoint", "one")
@@ -72,10 +74,10 @@ class Sweep(Training):
     num_starts: int = 16  # Start poses for each scored sequence.
 
     def __call__(self, machine: Machine) -> None:
+        recipe = self.recipe()
         from brokk_min.evaluation.metrics import COLUMNS, interval_text
         from brokk_min.evaluation.sweep import sweep
 
-        recipe = self.recipe()
         check(self.seeds > 0, "--seeds", "1 or more", self.seeds)
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         seeds = range(self.seed, self.seed + self.seeds)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from brokk_min._files import require_package, whole_file
+from brokk_min._files import whole_file
 from brokk_min.learning.policy import INTERFACES, Policy, contract
 from brokk_min.ppo import mlp
 
@@ -24,9 +24,7 @@ def export_onnx(path: Path, policy: Policy) -> None:
 
     The other program makes the observation and the command, as the policy's `env.Interface` does.
     What it must agree with is in the metadata, as JSON by name; examples/run_onnx.py reads it.
-    ValueError: the package onnxscript is not installed.
     """
-    require_package("onnxscript", "export")
     size = len(policy.weights[0])
     actor = mlp(size, len(policy.weights[-1]), 1.0).eval()
     for parameter, weight in zip(actor.parameters(), policy.weights, strict=True):

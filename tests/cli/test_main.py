@@ -40,6 +40,44 @@ def test_help__imports_nothing_slow():
     assert (done.stdout, done.stderr) == ("set()\n", "")
 
 
+WITHOUT_TORCH = """
+import sys
+class Blocked:
+    def find_spec(name, *_):
+        if name in ("torch", "dask", "distributed", "jinja2", "onnxscript"):
+            raise ModuleNotFoundError(f"No module named {name!r}")
+sys.meta_path.insert(0, Blocked)
+from brokk_min import shadow
+from brokk_min.__main__ import main
+from brokk_min.viewer import play, replay
+for line in (
+    "collect --out log.npz --hours 0.001",
+    "inspect log.npz",
+    "evaluate --num-starts 1 --commands c.csv",
+    "fit log.npz --out net.npz",
+    "train --actuator net.npz --out policy.npz",
+    "sweep --actuator net.npz --out folder",
+    "reproduce --out folder",
+    "export --policy policy.npz --out policy.onnx",
+):
+    print(line.split()[0], main(line.split()), file=sys.stderr)
+"""
+
+
+def test_commands__need_no_torch_or_say_how_to_install_it(tmp_path):
+    (tmp_path / "c.csv").write_text("sequence,time,vx,vy,vz\nup,0,0,0,0.1\nup,1,0,0,0\n")
+    command, environment = [sys.executable, "-c", WITHOUT_TORCH], {"PYTHONPATH": str(ROOT)}
+    options = {"cwd": tmp_path, "env": os.environ | environment}
+    done = subprocess.run(command, **options, capture_output=True, text=True)
+    said = done.stderr.splitlines()
+    assert {"collect 0", "inspect 0", "evaluate 0"} <= set(said), said
+    for name in ("fit", "train", "sweep", "reproduce"):
+        line = said[said.index(f"{name} 1") - 1]
+        assert line.startswith("brokk-min: torch: expected pip install -c constraints.txt -e '.[tr")
+    assert "onnxscript: expected pip install -c constraints.txt -e '.[export]'" in said[-2]
+    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".csv"] == ["log.npz"]
+
+
 GERMAN = """
 from dataclasses import replace
 from brokk_min.machine import BROKK_170
