@@ -93,7 +93,7 @@ def test_tick__survives_an_operator_that_fails_at_once(world):
 def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
     world.operator.enable, out, inputs = False, [], []
     world.downward = recording(out)
-    world.bus.log_input = inputs.append
+    world.bus.log_tick = lambda entered, late: inputs.append(entered)
     assert world.drive.tick() and world.drive.reason == "tick late, or the clock was set"
     world.run(1.0)
     assert world.drive.gate.active_fault == ""
@@ -102,7 +102,7 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
     world.operator.enable, world.operator.v = True, (0.0, 0.0, 0.0)
     world.drive.tick()
     world.drive.tick()
-    assert inputs[-1] == world.drive.operator_input.pack() and len(inputs) == world.drive.ticks
+    assert inputs[-1] == world.drive.operator_input and len(inputs) == world.drive.ticks
     frames = [data for can_id, data in out if can_id == 0x210]
     assert [list(f[:5]) for f in frames] == [[0] * 5, [40, 0, 40, 40, 40]]
     assert [f[7] for f in frames] == [1, 1] and frames[1][5] == frames[0][5] + 1
