@@ -18,7 +18,7 @@ from helpers_machines import obedient_net
 from brokk_min.actuator import AnalyticPlant
 from brokk_min.can.canopen import Frame, OperatorInput
 from brokk_min.can.connection import Bus, open_bus
-from brokk_min.can.simulated_machine import SimulatedMachine
+from brokk_min.can.simulated_machine import FaultyMachine
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.learning.policy import INTERFACES, Policy
@@ -94,7 +94,7 @@ class World:
     def __init__(self, controller, operator, log=None):
         self.time = 0.0  # s
         self.recorder = Recorder()
-        self.simulated = SimulatedMachine(BROKK_170, START, 0.0, self.recorder)
+        self.simulated = FaultyMachine(BROKK_170, START, 0.0, self.recorder)
         self.answers = deque()
         self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond

@@ -32,7 +32,7 @@ MAX_FRAMES = 256  # read in a tick; with more the bus is flooded
 WATCHDOG = 0.150  # s without valid valve frame, then the controller closes the valves (assumed)
 MOST_JOINTS = 5  # in a valve frame
 VALVES = 0x7F0  # and a joint's number: what is known of its valves, k and d up, k and d down
-LATENESS = 0x7FD  # of a tick, four bytes [us]
+LATENESS = 0x7FD  # of a tick, eight bytes [us]
 WOULD_SEND = 0x7FE  # of valve frames of `shadow`; these four are in the log, never on the bus
 OPERATOR_INPUT = 0x7FF  # of the operator's input
 

@@ -73,7 +73,7 @@ class Bus:
     def log_tick(self, entered: OperatorInput, lateness: float) -> None:
         """Log what a tick has beside the bus: the operator's input, and how late it was [s]."""
         self._log(self._message(OPERATOR_INPUT, entered.pack()), "operator")
-        self._log(self._message(LATENESS, struct.pack("<i", round(1e6 * lateness))), "timing")
+        self._log(self._message(LATENESS, struct.pack("<q", round(1e6 * lateness))), "timing")
 
     def log_valves(self, joint: int, data: bytes) -> None:
         """Log what is known of the valves of a joint, which is not on the bus."""

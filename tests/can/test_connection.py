@@ -41,7 +41,7 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes():
     assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 T", lines[0])
     assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 R", lines[1])
     assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#E8030CFE000003 T", lines[-2])
-    assert re.fullmatch(r"\(\d+\.\d{6}\) timing 7FD#34080000 T", lines[-1])
+    assert re.fullmatch(r"\(\d+\.\d{6}\) timing 7FD#3408000000000000 T", lines[-1])
 
 
 def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):

@@ -118,8 +118,8 @@ def test_read_telemetry__gives_at_each_sync_the_tick_before():
 def test_timing__counts_late_and_missed_ticks_by_hand():
     """98 ticks at 0.1 ms, one early by 1 us, one that begins 2.6 ticks late: two are missed."""
     late = [100] * 98 + [-1, 130_000]  # us
-    frames = [Frame(0.05 * k, LATENESS, struct.pack("<i", t), True) for k, t in enumerate(late)]
-    foreign = [Frame(9.0, LATENESS, bytes(4))]
+    frames = [Frame(0.05 * k, LATENESS, struct.pack("<q", t), True) for k, t in enumerate(late)]
+    foreign = [Frame(9.0, LATENESS, bytes(8))]
     words = "0.10 ms in the median, 1.40 ms in 99 %, 130.00 ms at most"
     assert timing(BROKK_170, frames + foreign) == [f"ticks late by {words}; 2 of 102 missed"]
     assert timing(BROKK_170, foreign) == []

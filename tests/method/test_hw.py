@@ -8,10 +8,11 @@ import sys
 import numpy as np
 import pytest
 from helpers_bus import START, ConstantCommand, HoldingOperator, World, raises, recording
-from helpers_faults import COMMAND, FAULTS, NOT_FOUND, delay, flood, foreign, freeze, measure
+from helpers_faults import COMMAND, FAULTS, NOT_FOUND, fail, flood, foreign, measure
 from helpers_machines import obedient_net, pids
 
 from brokk_min._files import SHIPPED
+from brokk_min.can import simulated_machine
 from brokk_min.can.canopen import valve_frame
 from brokk_min.can.operator_input import Script
 from brokk_min.env import reward
@@ -149,7 +150,7 @@ def test_tick__finds_a_frozen_encoder_at_small_commands_too(node, counts, bound,
     world.sleep(0.0215)
     begun = world.time
     assert world.commands[1][-1].any()
-    freeze(world, node)
+    fail(world, node, "stuck")
     world.run(2.0)
     assert closes_within(world, begun, bound)
     assert world.drive.reason == f"fault: q{node}: frozen, or the joint does not move"
@@ -180,13 +181,12 @@ def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(world
     assert closes_within(world, begun, 0.175)
 
 
-@pytest.mark.parametrize(("low", "high", "found"), [(15, 15, 0), (25, 25, 1), (0, 60, 1)])
-def test_tick__finds_positions_later_than_20_ms(low, high, found, world):
-    """Constantly, or by chance between two bounds [ms]."""
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize(("late", "found"), [(0.015, 0), (0.025, 1)])
+def test_tick__finds_positions_later_than_20_ms(late, found, world, monkeypatch):
+    monkeypatch.setattr(simulated_machine, "DELAY", late)
     world.run(0.8)
     begun = world.time
-    delay(world, 3, lambda: rng.uniform(low, high) / 1e3)
+    fail(world, 3, "delayed")
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
     assert closes_within(world, begun, 0.175) == bool(found)
