@@ -44,7 +44,8 @@ def moved(add):
 
 def fail(world, node, kind, command=None):
     """A node of the machine fails as by `--fault`; before, the controller may change its mind."""
-    world.controller.m[:] = world.controller.m if command is None else command
+    if command:
+        world.controller.m[:] = command
     world.simulated.faults.append(Fault(node, kind, world.time))
 
 
