@@ -46,8 +46,8 @@ CRANE = replace(
 )
 MACHINES = {"sound": BROKK_170, "faults": BROKK_170, "crane": CRANE}
 CAUSES = [  # of what is in the log, one each second
-    *("q1: stuck", "q3: wrong", "q4: slow", "q5: off", "q2: garbage", "q3: delayed"),
-    *("q4: doubled", "q1: malformed", "q5: rebooted", "q3: heartbeat lost", "valves: slow"),
+    *("q4: stuck", "q3: wrong", "q4: slow", "q5: off", "q2: garbage", "q3: delayed"),
+    *("q4: doubled", "q1: malformed", "q2: says FFFFFFFF", "q5: rebooted", "q3: heartbeat lost", "valves: slow"),
     *("position of q5 before SYNC as well", "foreign SYNC", "foreign valve frame"),
     *("flood of 6,000 foreign frames a second", "joystick unplugged", "enable released"),
 ]
@@ -60,11 +60,31 @@ class Operator:
         self.ticks, self.held, self.enable, self.alive, self.stop = 0, False, None, True, False
 
     def __call__(self, driving, ready):
+        self.told = [driving, ready]
         self.ticks += 1
         self.held = self.enable is None and (driving or (ready and not self.held))
-        x, y, z = 0.15 * np.sin(0.11 * self.ticks + np.array([1.0, 3.0, 5.0]))
-        v = (round(x, 4), round(y, 4), round(z, 4)) if driving else (0.0, 0.0, 0.0)
+        x, y, z = 0.2 * np.sin(0.08 * self.ticks + np.array([1.0, 3.0, 5.0]))
+        moves = driving or self.ticks < 8  # at first the stick is not centred
+        v = (round(x, 4), round(y, 4), round(z, 4)) if moves else (0.0, 0.0, 0.0)
         return OperatorInput(v, self.held, self.alive, self.stop)
+
+
+class Again:
+    """An operator whose inputs were recorded."""
+
+    def __init__(self, frames):
+        rows = (frame.data for frame in frames if frame.id == OPERATOR_INPUT and frame.sent)
+        self.inputs = iter([unpack(data) for data in rows])
+
+    def __call__(self, driving, ready):
+        self.told = [driving, ready]
+        return next(self.inputs)
+
+
+def unpack(data):
+    """The operator's input of seven bytes."""
+    x, y, z = (np.frombuffer(data[:6], "<i2") / 1e4).tolist()
+    return OperatorInput((x, y, z), *(bool(data[6] >> bit & 1) for bit in range(3)))
 
 
 class Fallible:
@@ -99,9 +119,11 @@ def state_of(drive):
         "fault of this tick": gate.active_fault,
         "fault that stopped it": gate.latched_fault,
         "reason": drive.reason,
+        "is anything measured": drive.measured is not None,
         "does it drive": gate.driving,
         "was it armed": gate.armed_once,
         "switch": gate.enable,
+        "driving and ready, as the operator was told": drive.operator.told,
         "operator's input": list(drive.operator_input.pack()),
         "command [counts]": np.rint(127 * gate.sent[..., -1]).astype(int),
         "place of a still encoder": gate.place,
@@ -143,6 +165,9 @@ class Replay(Bus):
 
     def send(self, can_id, data):
         wanted = self.frames.popleft() if self.frames else Frame(self.time, -1, b"")
+        if self.time > wanted.time + 1e-9:
+            words = f"frame 0x{can_id:03X}, time: recorded {wanted.time}, sent {self.time}"
+            self.differences.append(words)
         self.time = wanted.time
         if (wanted.id, wanted.data, wanted.sent) == (can_id, data, True):
             return
@@ -176,10 +201,8 @@ def replay(name, frames, told, changes=None):
     """Drive by the frames; AssertionError: the first difference, with its tick and field."""
     differences, machine = [], MACHINES[name]
     bus = Replay(frames, differences)
-    entered = [frame.data for frame in frames if frame.id == OPERATOR_INPUT and frame.sent]
-    inputs = iter([unpack(data) for data in entered])
     controller = Fallible(machine, changes_of(name) | (changes or {}))
-    drive = Drive(machine, controller, bus, lambda driving, ready: next(inputs))
+    drive = Drive(machine, controller, bus, Again(frames))
     read = digests(frames)
     try:
         drive.begin()
@@ -193,12 +216,6 @@ def replay(name, frames, told, changes=None):
             wanted = told[field][tick]
             assert np.array_equal(value, wanted), f"tick {tick}, {field}: {wanted}, got {value}"
     assert not bus.frames, f"tick {tick}, frame: recorded {bus.frames[0]}, sent none"
-
-
-def unpack(data):
-    """The operator's input of seven bytes."""
-    x, y, z = (np.frombuffer(data[:6], "<i2") / 1e4).tolist()
-    return OperatorInput((x, y, z), *(bool(data[6] >> bit & 1) for bit in range(3)))
 
 
 @pytest.mark.parametrize("name", MACHINES)
@@ -240,7 +257,7 @@ def record(name, folder):
     causes = iter(CAUSES if name == "faults" else [])
     world.drive.begin()
     while not rows or not operator.stop:
-        operator.stop = len(rows) == (479 if name == "faults" else 160)
+        operator.stop = len(rows) == (499 if name == "faults" else 160)
         if name == "faults" and len(rows) % 20 == 10:
             world.upward = world.downward = unchanged
             world.noise, operator.alive, operator.enable = list, True, None

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 from helpers_bus import START, ConstantCommand, HoldingOperator, World, raises, recording
-from helpers_faults import COMMAND, FAULTS, NOT_FOUND, fail, flood, foreign, measure
-from helpers_machines import obedient_net, pids
+from helpers_faults import COMMAND, FAULTS, NOT_FOUND, fail, flood, foreign, measure, stall
+from helpers_machines import DRIVEN, obedient_net, pids
 
 from brokk_min._files import SHIPPED
 from brokk_min.can import simulated_machine
@@ -24,12 +24,14 @@ from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
 
-@pytest.fixture
-def world():
+def started():
     """A constant command, an operator, and nodes that are started."""
     world = World(ConstantCommand(*COMMAND), HoldingOperator())
     world.drive.begin()
     return world
+
+
+world = pytest.fixture(started)
 
 
 def test_import__loads_no_library_that_is_not_needed():
@@ -91,8 +93,9 @@ def test_tick__survives_an_operator_that_fails_at_once(world):
     assert world.drive.gate.driving and world.drive.reason == ""
 
 
-def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
-    world.operator.enable, out, inputs = False, [], []
+def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later():
+    world, out, inputs = started(), [], []
+    world.operator.enable = False
     world.downward = recording(out)
     world.bus.log_tick = lambda entered, late: inputs.append(entered)
     assert world.drive.tick() and world.drive.reason == "tick late, or the clock was set"
@@ -240,6 +243,19 @@ def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world):
     assert np.diff(ticks).min() > 0.3
     assert np.diff(ticks)[[40, 90]] == pytest.approx([2.6, 5.2], abs=0.25)
     assert round(ticks[-1]) == 119 + 5  # none was made up for
+
+
+def test_wait__forgets_what_came_before_a_missed_tick():
+    """Samples of the history are a tick apart: it begins anew, with the arm at rest."""
+    world = started()
+    world.run(1.0)
+    moving = world.drive.history[0]
+    assert moving[DRIVEN, 1].any(axis=1).all() and moving[DRIVEN, 2].any(axis=1).all()
+    stall(world, 0.11)
+    world.drive.tick()
+    world.drive.tick()
+    history = world.drive.history[0]
+    assert (history[:, 0] == history[:, 0, -1:]).all() and not history[:, 1:].any()
 
 
 # --- endings -------------------------------------------------------------------------------------
