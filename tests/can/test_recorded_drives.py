@@ -46,10 +46,24 @@ CRANE = replace(
 )
 MACHINES = {"sound": BROKK_170, "faults": BROKK_170, "crane": CRANE}
 CAUSES = [  # of what is in the log, one each second
-    *("q4: stuck", "q3: wrong", "q4: slow", "q5: off", "q2: garbage", "q3: delayed"),
-    *("q4: doubled", "q1: malformed", "q2: says FFFFFFFF", "q5: rebooted", "q3: heartbeat lost", "valves: slow"),
-    *("position of q5 before SYNC as well", "foreign SYNC", "foreign valve frame"),
-    *("flood of 6,000 foreign frames a second", "joystick unplugged", "enable released"),
+    "q4: stuck",
+    "q3: wrong",
+    "q4: slow",
+    "q5: off",
+    "q2: garbage",
+    "q3: delayed",
+    "q4: doubled",
+    "q1: malformed",
+    "q2: says FFFFFFFF",
+    "q5: rebooted",
+    "q3: heartbeat lost",
+    "valves: slow",
+    "position of q5 before SYNC as well",
+    "foreign SYNC",
+    "foreign valve frame",
+    "flood of 6,000 foreign frames a second",
+    "joystick unplugged",
+    "enable released",
 ]
 
 
