@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Frame, checksum
-from brokk_min.can.connection import open_bus, stop_signals
+from brokk_min.can.connection import Bus, open_bus, stop_signals
 from brokk_min.machine import Array, Machine, require
 
 STEP = 0.005  # s, of the plant
@@ -247,13 +247,17 @@ def run_machine(
     """Run a simulated machine on a bus until a signal; it prints why its valve controller stops."""
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:
-        simulated = FaultyMachine(machine, start_pose(machine), bus.now(), plant, faults)
-        while not signals:
-            frame = bus.recv(max(0.0, simulated.next_step - bus.now()))
-            answers = simulated.advance(bus.now())
-            answers += simulated.receive(frame) if frame else []
-            for can_id, data in answers:
-                bus.send(can_id, data)
-            while simulated.reasons:
-                time, reason = bus.now() - simulated.start, simulated.reasons.pop(0)
-                print(f"{time:.3f} s, valve controller stops: {reason}", flush=True)
+        serve(FaultyMachine(machine, start_pose(machine), bus.now(), plant, faults), bus, signals)
+
+
+def serve(simulated: SimulatedMachine, bus: Bus, ended: Sequence[object]) -> None:
+    """Answer on the bus in real time until something is in `ended`."""
+    while not ended:
+        frame = bus.recv(max(0.0, simulated.next_step - bus.now()))
+        answers = simulated.advance(bus.now())
+        answers += simulated.receive(frame) if frame else []
+        for can_id, data in answers:
+            bus.send(can_id, data)
+        while simulated.reasons:
+            time, reason = bus.now() - simulated.start, simulated.reasons.pop(0)
+            print(f"{time:.3f} s, valve controller stops: {reason}", flush=True)
