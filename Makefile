@@ -23,6 +23,8 @@ check: .venv/installed-dev
 	$(RUN) coverage run -m pytest --numprocesses 2 --dist loadfile
 	$(RUN) coverage combine --quiet
 	$(RUN) coverage report
+	$(RUN) coverage report --fail-under=100 \
+		--include=brokk_min/hw.py,brokk_min/can/safety_gate.py,brokk_min/can/canopen.py
 
 lint: .venv/installed-dev
 	$(RUN) ruff check .

@@ -29,8 +29,8 @@ def groups(faults: dict[str, Any]) -> dict[str, list[Any]]:
     """Faults of one kind at several joints under one name."""
     kinds = defaultdict(list)
     for name, fault in faults.items():
-        joint = re.fullmatch(r"q[1-5] (.*)", name) if faults is FAULTS else None
-        kinds[f"position {joint[1]}" if joint else name].append(fault)
+        joint = re.fullmatch(r"q[1-5](: .*)", name) if faults is FAULTS else None
+        kinds[f"encoder{joint[1]}" if joint else name].append(fault)
     return kinds
 
 

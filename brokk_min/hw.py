@@ -79,7 +79,7 @@ class Drive:
         command = self.attempt(self.control, counts, default=np.zeros(self.machine.n))
         stop = self.operator_input.stop or bool(self.signals)
         self.operator_input = self.operator_input._replace(stop=stop)
-        self.attempt(lambda: self.bus.log_input(self.operator_input.pack()))
+        self.attempt(self.bus.log_tick, self.operator_input, self.lateness)
         self.send_command(command, counts)
         self.nodes.start_tick()
         self.attempt(self.restart_nodes)

@@ -18,7 +18,7 @@ from helpers_machines import obedient_net
 from brokk_min.actuator import AnalyticPlant
 from brokk_min.can.canopen import Frame, OperatorInput
 from brokk_min.can.connection import Bus, open_bus
-from brokk_min.can.simulated_machine import SimulatedMachine
+from brokk_min.can.simulated_machine import FaultyMachine, start_pose
 from brokk_min.hw import Drive
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
 from brokk_min.learning.policy import INTERFACES, Policy
@@ -91,17 +91,17 @@ class World:
 
     step = 0.001  # s
 
-    def __init__(self, controller, operator, log=None):
+    def __init__(self, controller, operator, log=None, machine=BROKK_170):
         self.time = 0.0  # s
         self.recorder = Recorder()
-        self.simulated = SimulatedMachine(BROKK_170, START, 0.0, self.recorder)
+        self.simulated = FaultyMachine(machine, start_pose(machine), 0.0, self.recorder)
         self.answers = deque()
         self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond
         self.syncs = []
         self.bus = Bus(self, "virtual", log, clock=lambda: self.time, sleep=self.sleep)
         self.bus.start = 1.8e9  # s; a fixed time of day, so that roundings repeat themselves
-        self.drive = Drive(BROKK_170, controller, self.bus, operator)
+        self.drive = Drive(machine, controller, self.bus, operator)
         self.controller, self.operator = controller, operator
 
     def send(self, message, timeout=None):

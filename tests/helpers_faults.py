@@ -8,11 +8,12 @@ import can
 import numpy as np
 from helpers_bus import ConstantCommand, HoldingOperator, World, only, raises
 
-from brokk_min.can.canopen import encoder_raw, valve_frame
+from brokk_min.can.canopen import valve_frame
+from brokk_min.can.simulated_machine import Fault
 from brokk_min.machine import BROKK_170
 
 COMMAND = (60, 0, 60, 60, 60)
-STEP = BROKK_170.encoder_step[0]
+VALVES = BROKK_170.controller_node
 FOREIGN = range(0x300, 0x500)  # identifiers of no frame of ours
 
 
@@ -41,25 +42,11 @@ def moved(add):
     return lambda data: [struct.pack("<I", (struct.unpack("<I", data)[0] + add) % 2**26)]
 
 
-def freeze(world, node, command=None):
-    """An encoder stays at one place."""
-    world.controller.m[:] = world.controller.m if command is None else command
-    counts = np.rint(world.simulated.state.q / STEP).astype(int)
-    place = struct.pack("<I", encoder_raw(BROKK_170, counts)[node - 1])
-    up(0x180 + node, lambda _: [place])(world)
-
-
-def delay(world, node, draw):
-    """Positions come `draw()` seconds late."""
-    tpdo, held = 0x180 + node, []
-    up(tpdo, lambda data: held.append((world.time + draw(), (tpdo, data))) or [])(world)
-
-    def due():
-        frames = [frame for then, frame in held if then <= world.time]
-        held[:] = [item for item in held if item[0] > world.time]
-        return frames
-
-    world.noise = due
+def fail(world, node, kind, command=None):
+    """A node of the machine fails as by `--fault`; before, the controller may change its mind."""
+    if command:
+        world.controller.m[:] = command
+    world.simulated.faults.append(Fault(node, kind, world.time))
 
 
 def flood(world, ids=range(2048), rate=2000):
@@ -116,7 +103,7 @@ OTHER_SENDER = "SYNC, NMT or valve frame of another sender"
 NOT_OPERATIONAL = "valve controller: not operational"
 EARLY, DOUBLED = "position before SYNC", "position doubled, not of 4 bytes"
 FAULTS = {
-    "valve controller silent": (up(0x710, lambda d: []), "valve controller: heartbeat lost"),
+    "valves: off": (partial(fail, node=VALVES, kind="off"), "valve controller: heartbeat lost"),
     "valve controller stopped": (up(0x710, lambda d: [b"\x04"]), NOT_OPERATIONAL),
     "flood on all identifiers": (flood, ""),
     "flood of 6,000 foreign frames a second": (partial(flood, ids=FOREIGN, rate=6e3), "flooded"),
@@ -125,9 +112,7 @@ FAULTS = {
     "foreign valve frame": (partial(foreign, can_id=0x210, data=THEIRS), OTHER_SENDER),
     "bus closed": (close_bus, "error (CanOperationError: closed)"),
     "send error of all frames": (put("downward", SEND_ERROR), "(CanOperationError"),
-    "valve frame lost": (valves(lambda d: []), NOT_OPERATIONAL),
     "valve frame doubled": (valves(lambda d: [d, d]), NOT_OPERATIONAL),
-    "valve frame's bit flipped": (valves(lambda d: [bytes([d[0] ^ 4, *d[1:]])]), NOT_OPERATIONAL),
     "joystick unplugged": (put("operator.alive", False), "operator's device lost"),
     "joystick raises": (put("operator.act", raises(OSError("gone"))), "error (OSError: gone)"),
     "enable released": (put("operator.enable", False), ""),
@@ -140,11 +125,20 @@ FAULTS = {
     "policy moves the locked joint": (command(1, 20), "q2: no valid command"),
     "policy raises": (put("controller.act", raises(RuntimeError("no"))), "error (RuntimeError"),
 }
+for kind in ("stuck", "garbage", "wrong", "slow", "intermittent"):
+    FAULTS[f"valves: {kind}"] = partial(fail, node=VALVES, kind=kind), NOT_OPERATIONAL
+OF_ENCODER = {
+    "off": "silent",
+    "stuck": "frozen",
+    "garbage": "",
+    "wrong": "jumped",
+    "slow": "silent",
+    "delayed": "silent",
+    "intermittent": "silent",
+}
 for node in range(1, 6):
     tpdo, heartbeat = 0x180 + node, 0x700 + node
     of_joint = {
-        "dropped": (up(tpdo, lambda d: []), "silent"),
-        "jumps": (up(tpdo, moved(90)), "jumped"),
         "jumps by half a turn": (up(tpdo, moved(2048)), "out of range"),
         "says FFFFFFFF": (up(tpdo, lambda d: [b"\xff" * 4]), DOUBLED),
         # the last answer ends the wait: its double comes before the next SYNC
@@ -153,16 +147,21 @@ for node in range(1, 6):
         "heartbeat lost": (up(heartbeat, lambda d: []), "heartbeat lost"),
         "rebooted": (up(heartbeat, lambda d: [b"\x00"]), "not operational"),
     }
-    if node != 2:  # the operator moves q2, no command of ours
-        of_joint["frozen"] = partial(freeze, node=node), "frozen"
+    for kind, words in OF_ENCODER.items():
+        of_joint[kind] = partial(fail, node=node, kind=kind), words
     for name, (cause, words) in of_joint.items():
-        FAULTS[f"q{node} {name}"] = (cause, f"q{node}: {words}")
+        FAULTS[f"q{node}: {name}"] = (cause, f"q{node}: {words}")
+del FAULTS["q2: stuck"]  # a joint that is not driven
 cause = partial(foreign, can_id=0x185, data=bytes(4))
 FAULTS["position of q5 before SYNC as well"] = (cause, f"q5: {EARLY}")
 NOT_FOUND = {
-    "q2 frozen, the locked joint": (partial(freeze, node=2), "it may stand still"),
+    "valves: delayed": (partial(fail, node=VALVES, kind="delayed"), "the machine follows later"),
+    "q2: stuck, the locked joint": (partial(fail, node=2, kind="stuck"), "it may stand still"),
     "q3 a tick late, without a gap": (partial(repeat_once, node=3), "no time, no number"),
-    "slow q3 frozen": (partial(freeze, node=3, command=(15, 0, 15, 15, 15)), "it takes longer"),
+    "q3: stuck, at small commands": (
+        partial(fail, node=3, kind="stuck", command=(15, 0, 15, 15, 15)),
+        "it takes longer",
+    ),
     "q3 drifts by 60 counts/s": (partial(drift, node=3, speed=60), "it looks like motion"),
     "4,500 foreign frames a second": (partial(flood, ids=FOREIGN, rate=4500), "harmless"),
 }

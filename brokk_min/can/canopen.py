@@ -32,7 +32,8 @@ MAX_FRAMES = 256  # read in a tick; with more the bus is flooded
 WATCHDOG = 0.150  # s without valid valve frame, then the controller closes the valves (assumed)
 MOST_JOINTS = 5  # in a valve frame
 VALVES = 0x7F0  # and a joint's number: what is known of its valves, k and d up, k and d down
-WOULD_SEND = 0x7FE  # of valve frames of `shadow`; these three are in the log, never on the bus
+LATENESS = 0x7FD  # of a tick, eight bytes [us]
+WOULD_SEND = 0x7FE  # of valve frames of `shadow`; these four are in the log, never on the bus
 OPERATOR_INPUT = 0x7FF  # of the operator's input
 
 
@@ -103,7 +104,7 @@ def check_bus(machine: Machine) -> None:
     nodes, valves = node_numbers(machine), machine.valve_frame_id
     bases = (EMERGENCY, TPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
     others = {NMT, SYNC, *(base + node for base in bases for node in nodes)}
-    free = valves < WOULD_SEND and valves not in others
+    free = valves < VALVES and valves not in others
     require(free, "valve_frame_id", "an identifier of no other frame", f"0x{valves:03X}")
     for joint in machine.joints:
         width = joint.q_max - joint.q_min

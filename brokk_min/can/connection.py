@@ -3,6 +3,7 @@
 import os
 import select
 import signal
+import struct
 import time
 from collections import deque
 from collections.abc import Callable, Container, Iterator
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from brokk_min._files import brief, require_package
-from brokk_min.can.canopen import OPERATOR_INPUT, VALVES, WOULD_SEND, Frame
+from brokk_min.can.canopen import LATENESS, OPERATOR_INPUT, VALVES, WOULD_SEND, Frame, OperatorInput
 
 
 @dataclass
@@ -69,9 +70,10 @@ class Bus:
         self.echoes.append((can_id, data))
         self._log(message, self.name)
 
-    def log_input(self, data: bytes) -> None:
-        """Log the operator's input, which is not on the bus."""
-        self._log(self._message(OPERATOR_INPUT, data), "operator")
+    def log_tick(self, entered: OperatorInput, lateness: float) -> None:
+        """Log what a tick has beside the bus: the operator's input, and how late it was [s]."""
+        self._log(self._message(OPERATOR_INPUT, entered.pack()), "operator")
+        self._log(self._message(LATENESS, struct.pack("<q", round(1e6 * lateness))), "timing")
 
     def log_valves(self, joint: int, data: bytes) -> None:
         """Log what is known of the valves of a joint, which is not on the bus."""

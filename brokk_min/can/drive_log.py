@@ -72,6 +72,18 @@ def read_telemetry(machine: Machine, frames: Iterable[Frame]) -> Iterator[Teleme
             start = frame.time
 
 
+def timing(machine: Machine, frames: Iterable[Frame]) -> list[str]:
+    """A line on how late the ticks of a drive were; none if the log does not say it."""
+    own = (frame for frame in frames if frame.id == canopen.LATENESS and frame.sent)
+    late = np.array([int.from_bytes(frame.data, "little", signed=True) for frame in own]) / 1e6
+    if not len(late):
+        return []
+    median, nearly_all, most = 1e3 * np.quantile(late, (0.5, 0.99, 1.0))
+    missed = int(np.maximum(late // machine.dt, 0).sum())  # as `Drive.wait` counts them
+    words = f"{median:.2f} ms in the median, {nearly_all:.2f} ms in 99 %, {most:.2f} ms at most"
+    return [f"ticks late by {words}; {missed} of {len(late) + missed} missed"]
+
+
 def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     """Commands and angles while driving, as recordings for `fit`; a gap or jump starts a new one.
 

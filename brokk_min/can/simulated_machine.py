@@ -2,7 +2,9 @@
 
 import gc
 import struct
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,8 +12,8 @@ from numpy.typing import ArrayLike
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Frame, checksum
-from brokk_min.can.connection import open_bus, stop_signals
-from brokk_min.machine import Array, Machine
+from brokk_min.can.connection import Bus, open_bus, stop_signals
+from brokk_min.machine import Array, Machine, require
 
 STEP = 0.005  # s, of the plant
 PRE_OPERATIONAL = 127  # NMT state after each NMT command but the start
@@ -118,6 +120,116 @@ class SimulatedMachine:
         return struct.pack("<BHBI", 0x43 if command == 0x40 else 0x60, index, sub, value)
 
 
+KINDS = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent", "ok")
+DELAY = 0.025  # s, more than the program waits for positions at 20 Hz
+PAUSE = 0.1  # s without frames, then as long with them: an intermittent fault
+
+
+class Fault(NamedTuple):
+    """What a node does from a time on, in the words of PX4's failure injection."""
+
+    node: int
+    kind: str  # one of `KINDS`; "ok" ends the fault before
+    time: float  # s after the start
+
+
+def parse_fault(machine: Machine, text: str) -> list[Fault]:
+    """Faults of [NAME:]KIND@SECONDS; NAME is a joint, whose encoder fails, or `valves`.
+
+    Without a name all encoders fail. ValueError: there is no such node, kind or time.
+    """
+    nodes = dict(zip([*machine.names, "valves"], canopen.node_numbers(machine)))
+    what, _, seconds = text.partition("@")
+    name, _, kind = what.rpartition(":")
+    of = [nodes.get(name, -1)] if name else [joint.encoder_node for joint in machine.joints]
+    known = kind in KINDS and -1 not in of and seconds.replace(".", "", 1).isdecimal()
+    wanted = f"[NAME:]KIND@SECONDS, a name of {[*nodes]}, a kind of {[*KINDS]}"
+    require(known, "--fault", wanted, text)
+    return [Fault(node, kind, float(seconds)) for node in of]
+
+
+class FaultyMachine(SimulatedMachine):
+    """A simulated machine whose nodes fail: frames change on the way from an encoder or to a valve.
+
+    A node that is off sends nothing at all. One that is stuck repeats its last sound frame; garbage
+    is random bytes, a wrong frame has one wrong bit, a slow node loses every second frame, delayed
+    frames come `DELAY` later, and intermittent ones are lost in every second `PAUSE`.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        q: ArrayLike,
+        now: float,
+        plant: Plant = PLANT,
+        faults: Sequence[Fault] = (),
+    ) -> None:
+        super().__init__(machine, q, now, plant)
+        self.faults = [*faults]
+        self.last: dict[int, bytes] = {}  # sound data of each node
+        self.frames = dict.fromkeys(self.nmt, 0)  # of each node, so far
+        self.late: list[tuple[float, int, bytes]] = []  # time to come, node, data
+        self.rng = np.random.default_rng(0)
+
+    def advance(self, now: float) -> Outgoing:
+        """As of a sound machine; then come frames that were delayed."""
+        out = self._without_off(super().advance(now), now)
+        due = [frame for frame in self.late if frame[0] <= now]
+        self.late = [frame for frame in self.late if frame[0] > now]
+        for time, node, data in due:
+            if node == self.controller:
+                super().receive(Frame(time, self.machine.valve_frame_id, data))
+            else:
+                out.append((canopen.TPDO1 + node, data))
+        return out
+
+    def receive(self, frame: Frame) -> Outgoing:
+        """As of a sound machine, but for the frames of nodes that fail."""
+        if frame.id == self.machine.valve_frame_id:
+            for data in self._through(self.controller, frame.data, frame.time):
+                super().receive(frame._replace(data=data))
+            return []
+        out = super().receive(frame)
+        if frame.id == canopen.SYNC:
+            changed = [(i, self._through(i - canopen.TPDO1, x, frame.time)) for i, x in out]
+            out = [(i, data) for i, frames in changed for data in frames]
+        return self._without_off(out, frame.time)
+
+    def _without_off(self, out: Outgoing, now: float) -> Outgoing:
+        """Frames of nodes that are not off; the last seven bits of an identifier are the node's."""
+        return [frame for frame in out if self._fault(frame[0] % 0x80, now)[0] != "off"]
+
+    def _fault(self, node: int, now: float) -> tuple[str, float]:
+        """Kind of the newest fault of a node that has begun, and the time since then [s]."""
+        begun = [fault for fault in self.faults if fault.node == node]
+        begun = [fault for fault in begun if self.start + fault.time <= now]
+        newest = max(begun, key=lambda fault: fault.time, default=Fault(node, "ok", 0.0))
+        return newest.kind, now - self.start - newest.time
+
+    def _through(self, node: int, data: bytes, now: float) -> list[bytes]:
+        """What comes of a frame of a node: nothing, or its data, perhaps changed."""
+        kind, seconds = self._fault(node, now)
+        self.frames[node] += 1
+        match kind:
+            case "off":
+                return []
+            case "stuck":
+                return [self.last.get(node, data)]
+            case "garbage":
+                return [self.rng.bytes(len(data))]
+            case "wrong":
+                return [bytes([data[0] ^ 0x40, *data[1:]])]
+            case "slow":
+                return [data] * (self.frames[node] % 2)
+            case "delayed":
+                self.late.append((now + DELAY, node, data))
+                return []
+            case "intermittent":
+                return [data] * int(seconds // PAUSE % 2)
+        self.last[node] = data
+        return [data]
+
+
 def start_pose(machine: Machine) -> Array:
     """Angles at the start [rad] (n,): `q_start` with the first joint forward, else mid-range."""
     if machine.q_start:
@@ -125,17 +237,27 @@ def start_pose(machine: Machine) -> Array:
     return (machine.column("q_min") + machine.column("q_max")) / 2
 
 
-def run_machine(machine: Machine, interface: str, channel: str, plant: Plant = PLANT) -> None:
+def run_machine(
+    machine: Machine,
+    interface: str,
+    channel: str,
+    plant: Plant = PLANT,
+    faults: Sequence[Fault] = (),
+) -> None:
     """Run a simulated machine on a bus until a signal; it prints why its valve controller stops."""
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:
-        simulated = SimulatedMachine(machine, start_pose(machine), bus.now(), plant)
-        while not signals:
-            frame = bus.recv(max(0.0, simulated.next_step - bus.now()))
-            answers = simulated.advance(bus.now())
-            answers += simulated.receive(frame) if frame else []
-            for can_id, data in answers:
-                bus.send(can_id, data)
-            while simulated.reasons:
-                time, reason = bus.now() - simulated.start, simulated.reasons.pop(0)
-                print(f"{time:.3f} s, valve controller stops: {reason}", flush=True)
+        serve(FaultyMachine(machine, start_pose(machine), bus.now(), plant, faults), bus, signals)
+
+
+def serve(simulated: SimulatedMachine, bus: Bus, ended: Sequence[object]) -> None:
+    """Answer on the bus in real time until something is in `ended`."""
+    while not ended:
+        frame = bus.recv(max(0.0, simulated.next_step - bus.now()))
+        answers = simulated.advance(bus.now())
+        answers += simulated.receive(frame) if frame else []
+        for can_id, data in answers:
+            bus.send(can_id, data)
+        while simulated.reasons:
+            time, reason = bus.now() - simulated.start, simulated.reasons.pop(0)
+            print(f"{time:.3f} s, valve controller stops: {reason}", flush=True)

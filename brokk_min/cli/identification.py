@@ -14,7 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from brokk_min._files import expected, require_package, write_json
 from brokk_min.beyond.rich_excitation import RICH
-from brokk_min.can.drive_log import log_for_fit, read_frames
+from brokk_min.can.drive_log import log_for_fit, read_frames, timing
 from brokk_min.cli.options import Command, check, check_settings, find_plant
 from brokk_min.fit import SINE, Log, collect
 from brokk_min.identification import columns, logs
@@ -68,7 +68,7 @@ class ReadsLogs(Command):
     def read_log(self, path: Path, machine: Machine) -> Log:
         """A table or a recording of ROS, else a log of a CAN bus."""
         mapped = columns.parse_map(self.map)
-        if path.is_dir() or path.suffix.lower() in columns.TABLES:
+        if is_table(path):
             return logs.read_log(path, machine, mapped, self.topics)
         require(not mapped, "--map", "a table or a recording of ROS", path)
         with expected(path, "a log"):
@@ -96,7 +96,9 @@ class Inspect(ReadsLogs):
                 driven = select_nets(known, net)
                 learned = valve_report.from_log(known, driven, log)
                 print(*valve_report.describe(known, learned), sep="\n")
-        print(f"{len(log.recordings)} recordings", *inspection.table(reports), sep="\n")
+        drives = [read_frames(path) for path in self.logs if not is_table(path)]
+        times = [line for frames in drives for line in timing(machine, frames)]
+        print(*times, f"{len(log.recordings)} recordings", *inspection.table(reports), sep="\n")
         print_scores(scores, warnings)
 
 
@@ -149,6 +151,11 @@ class Fit(ReadsLogs):
             write_json(self.json, {"meta": meta, "joints": scores, "warnings": warnings})
         print(f"{self.out}: nets of {name or 'an unknown machine'}")
         print_scores(scores, warnings)
+
+
+def is_table(path: Path) -> bool:
+    """Is it a table or a recording of ROS, no log of a bus?"""
+    return path.is_dir() or path.suffix.lower() in columns.TABLES
 
 
 def print_scores(scores: Mapping[str, Any], warnings: Sequence[str]) -> None:

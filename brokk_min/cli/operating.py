@@ -16,7 +16,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.adaptation import Adaptive, valves
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
-from brokk_min.can.simulated_machine import run_machine
+from brokk_min.can.simulated_machine import parse_fault, run_machine
 from brokk_min.cli.options import Command, check, default_policy, find_plant
 from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
 from brokk_min.evaluation.rollout import title
@@ -33,10 +33,12 @@ class Simulate(Command):
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
     plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped every 5 ms.
+    fault: tuple[str, ...] = ()  # [JOINT:]KIND@SECONDS, as q3:stuck@5 ok@8; see docs/hardware.md.
 
     def __call__(self, machine: Machine) -> None:
+        faults = [fault for text in self.fault for fault in parse_fault(machine, text)]
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
-        run_machine(machine, self.interface, self.channel, find_plant(self.plant, machine))
+        run_machine(machine, self.interface, self.channel, find_plant(self.plant, machine), faults)
 
 
 @dataclass(kw_only=True)

@@ -67,14 +67,23 @@ def test_copies__share_all_but_what_their_own_actions_change(interface):
     assert ended
 
 
-def test_window__ends_in_the_state_of_one_of_the_group_and_keeps_own_last_observations():
+@pytest.mark.parametrize("ticks", [0, 30 - WINDOW])
+def test_window__ends_in_the_state_of_one_of_the_group_and_keeps_own_last_observations(ticks):
+    """Where the first group's episodes end with the window, their last one is not of the next."""
     env, twin = make(), make()
     twin.horizon = 1000
+    for each in (env.inner, twin.inner):
+        each.episodes.state.ticks[:COPIES] = ticks
     for actions in np.random.default_rng(0).uniform(-1, 1, (WINDOW, 12, 4)):
-        own, *_ = twin.step(actions)
+        own, *_, last = twin.step(actions)
         obs, _, terminated, truncated, info = env.step(actions)
     assert truncated.all() and not terminated.any() and info["_final_obs"].all()
-    assert np.array_equal(info["final_obs"], own)
+    expected = own.copy()
+    if ticks:
+        assert last["_final_obs"].tolist() == [True] * COPIES + [False] * 2 * COPIES
+        expected[:COPIES] = last["final_obs"][:COPIES]
+    assert np.array_equal(info["final_obs"], expected)
+    assert np.array_equal(expected, own) == (ticks == 0)
     chosen = [
         np.flatnonzero((twin.inner.episodes.state.q == q).all(axis=1))
         for q in groups(env.inner.episodes.state.q)[:, 0]

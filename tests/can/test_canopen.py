@@ -10,6 +10,7 @@ from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, dat
 from helpers_bus import BASELINE, START, HoldingOperator, World, eventually, only, recording
 
 from brokk_min.can.canopen import (
+    Frame,
     Nodes,
     checksum,
     encoder_counts,
@@ -125,10 +126,38 @@ def test_set_up_nodes__refuses_an_encoder_that_does_not_fit(upward, refusal):
 )
 def test_machines_that_do_not_fit_the_bus__are_refused_on_both_its_sides(machine, refusal):
     with pytest.raises(ValueError, match=refusal):
-        set_up_nodes(None, machine)
-    with pytest.raises(ValueError, match=refusal):
         SimulatedMachine(machine, np.zeros(machine.n), 0.0)
+    with pytest.raises(ValueError, match=refusal):
+        set_up_nodes(None, machine)
     SimulatedMachine(replace(SLOW, rate=10.0), START, 0.0)
+
+
+def test_nodes__take_in_frames_by_hand():
+    """Cut frames, a fallen node with its toggle bit, and what is nobody's change nothing else."""
+    nodes, neutral = Nodes(BROKK_170), valve_frame([0] * 5, 1, 1).tobytes()
+    for can_id, data in (
+        (0x181, b"\x01\x02\0\0"),
+        (0x182, b"\xff\xff\xff\xff"),
+        (0x183, b"\1\2\3"),
+        (0x184, b"\3\0\0\0"),
+        (0x184, b"\4\0\0\0"),
+        (0x701, b"\x85"),
+        (0x702, b""),
+        (0x703, b"\5\5"),
+        (0x710, b"\x7f"),
+        (0x210, valve_frame(np.array([1.0, 0, -1.0, 0, 0]), 1, 1).tobytes()),
+        (0x210, neutral[:7]),
+        (0x211, neutral),
+        (0x080, b""),
+    ):
+        nodes.update(Frame(7.0, can_id, data))
+    assert nodes.raw.tolist() == [513, -1, -1, 4, -1] and nodes.frames.tolist() == [1, 2, 2, 2, 0]
+    assert nodes.nmt.tolist() == [5, 0, 0, 0, 0, 127]
+    assert np.isfinite(nodes.heartbeat).tolist() == [True, *[False] * 4, True]
+    assert nodes.u.tolist() == [1, 0, -1, 0, 0] and nodes.enable and nodes.valve_time == 7.0
+    assert (nodes.received, nodes.others) == (13, 3)
+    nodes.start_tick()
+    assert not nodes.frames.any() and (nodes.received, nodes.others) == (0, 0)
 
 
 def dictionary():

@@ -13,7 +13,7 @@ import can
 import pytest
 from helpers_bus import raises
 
-from brokk_min.can.canopen import Frame
+from brokk_min.can.canopen import Frame, OperatorInput
 from brokk_min.can.connection import Bus, open_bus
 
 
@@ -35,12 +35,13 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes():
         frames = [bus.recv(0.5) for _ in range(6)]
         assert [frame.id for frame in frames] == [-1, 0x123, -1, -1, -1, -1]
         assert frames[0] == Frame(bus.now(), -1, b"\x01\x02") and bus.recv(0.0) is None
-    bus.log_input(b"\x09")
+    bus.log_tick(OperatorInput((0.1, -0.05, 0), enable=True), 0.0021)
     lines = text.getvalue().splitlines()
-    assert len(lines) == 7
+    assert len(lines) == 8
     assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 T", lines[0])
     assert re.fullmatch(r"\(\d+\.\d{6}\) can0 123#0102 R", lines[1])
-    assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#09 T", lines[-1])
+    assert re.fullmatch(r"\(\d+\.\d{6}\) operator 7FF#E8030CFE000003 T", lines[-2])
+    assert re.fullmatch(r"\(\d+\.\d{6}\) timing 7FD#3408000000000000 T", lines[-1])
 
 
 def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):

@@ -8,8 +8,15 @@ import can
 import numpy as np
 import pytest
 
-from brokk_min.can.canopen import OPERATOR_INPUT, Frame, OperatorInput, encoder_raw, valve_frame
-from brokk_min.can.drive_log import log_for_fit, read_frames, read_telemetry
+from brokk_min.can.canopen import (
+    LATENESS,
+    OPERATOR_INPUT,
+    Frame,
+    OperatorInput,
+    encoder_raw,
+    valve_frame,
+)
+from brokk_min.can.drive_log import log_for_fit, read_frames, read_telemetry, timing
 from brokk_min.machine import BROKK_170
 
 STEP = BROKK_170.encoder_step[0]
@@ -106,3 +113,13 @@ def test_read_telemetry__gives_at_each_sync_the_tick_before():
     np.testing.assert_array_equal(last.q, np.rint((q + 0.05) / STEP) * STEP)
     np.testing.assert_allclose(last.u * 127, [50, 0, -80, 0, 0])
     np.testing.assert_allclose(last.v_goal, [0.1, 0.0, -0.1235])
+
+
+def test_timing__counts_late_and_missed_ticks_by_hand():
+    """98 ticks at 0.1 ms, one early by 1 us, one that begins 2.6 ticks late: two are missed."""
+    late = [100] * 98 + [-1, 130_000]  # us
+    frames = [Frame(0.05 * k, LATENESS, struct.pack("<q", t), True) for k, t in enumerate(late)]
+    foreign = [Frame(9.0, LATENESS, bytes(8))]
+    words = "0.10 ms in the median, 1.40 ms in 99 %, 130.00 ms at most"
+    assert timing(BROKK_170, frames + foreign) == [f"ticks late by {words}; 2 of 102 missed"]
+    assert timing(BROKK_170, foreign) == []

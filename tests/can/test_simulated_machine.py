@@ -7,7 +7,7 @@ import pytest
 from helpers_bus import START, Recorder
 
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame
-from brokk_min.can.simulated_machine import SimulatedMachine, start_pose
+from brokk_min.can.simulated_machine import FaultyMachine, SimulatedMachine, parse_fault, start_pose
 from brokk_min.machine import BROKK_170
 
 CONTROLLER = 16
@@ -106,3 +106,70 @@ def test_start_pose__is_the_machines_or_the_middle():
     low, high = BROKK_170.column("q_min"), BROKK_170.column("q_max")
     np.testing.assert_array_equal(start_pose(BROKK_170), START)
     np.testing.assert_allclose(start_pose(replace(BROKK_170, q_start=())), (low + high) / 2)
+
+
+ENCODER = {  # counts of q3 from SYNC to SYNC; the joint turns by a count a tick
+    "off": [[], [], [], []],
+    "stuck": [[8], [8], [8], [8]],
+    "wrong": [[9 + 64], [10 + 64], [11 + 64], [12 + 64]],
+    "slow": [[], [10], [], [12]],
+    "delayed": [[], [9], [10], [11]],
+    "intermittent": [[], [], [11], [12]],
+    "ok": [[9], [10], [11], [12]],
+}
+
+
+@pytest.mark.parametrize("kind", ENCODER)
+def test_faults__of_encoders_by_hand(kind):
+    """From the 20th tick on to the 23rd; without a name all encoders fail."""
+    faults = parse_fault(BROKK_170, f"{kind}@1.0") + parse_fault(BROKK_170, "q3:ok@1.2")
+    machine = FaultyMachine(BROKK_170, START, 0.0, Recorder(), faults)
+    machine.receive(Frame(0.0, 0x000, b"\1\0"))
+    came, beats = [], []
+    for k in range(1, 24 + 1):
+        now = 0.05 * k + 0.01
+        sent = machine.advance(now)
+        machine.state = machine.state._replace(q=BROKK_170.encoder_step * (k - 11))
+        sent += machine.receive(Frame(now, 0x080, b""))
+        came.append([int.from_bytes(data, "little") for can_id, data in sent if can_id == 0x183])
+        beats.append({can_id - 0x700 for can_id, _ in sent if can_id > 0x700})
+    assert came[17:] == [[7], [8], *ENCODER[kind], [12, 13] if kind == "delayed" else [13]]
+    alive = {CONTROLLER} if kind == "off" else {1, 2, 3, 4, 5, CONTROLLER}
+    assert beats[18:] == [{1, 2, 3, 4, 5, CONTROLLER}, *4 * [alive], alive | {3}]
+
+
+@pytest.mark.parametrize(
+    ("kind", "counts", "reasons"),
+    [
+        ("off", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
+        ("stuck", [0, 0, 0, 0], ["valve frame with counter 2 after 2"]),
+        ("garbage", [0, 0, 0, 0], [MALFORMED]),
+        ("wrong", [0, 0, 0, 0], [MALFORMED]),
+        ("slow", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
+        ("delayed", [42, 43, 44, 45], []),
+        ("intermittent", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
+        ("ok", [43, 44, 45, 46], []),
+    ],
+)
+def test_faults__of_the_valve_controller_by_hand(kind, counts, reasons):
+    """Commands in force after each tick, and why the valve controller stopped first."""
+    faults = parse_fault(BROKK_170, f"valves:{kind}@0.15")
+    machine = FaultyMachine(BROKK_170, START, 0.0, Recorder(), faults)
+    machine.receive(Frame(0.0, 0x000, b"\1\0"))
+    found = []
+    for k in range(7):
+        now = 0.05 * k + 0.01
+        machine.advance(now)
+        machine.receive(Frame(now, 0x080, b""))
+        u = np.array([(40 + k) * (k > 0), 0, 0, 0, 0]) / 127
+        machine.receive(Frame(now, 0x210, valve_frame(u, k, 1).tobytes()))
+        found.append(round(127 * machine.u[0]))
+    assert found == [0, 41, 42, *counts]
+    assert machine.reasons[:1] == reasons
+
+
+@pytest.mark.parametrize("text", ["stuck", "stuck@", "stuck@-1", "broken@1", "q9:stuck@1", "@1"])
+def test_parse_fault__refuses_what_it_does_not_know(text):
+    refusal = r"--fault: expected \[NAME:\]KIND@SECONDS, a name of .* 'valves'\], a kind of .* got "
+    with pytest.raises(ValueError, match=f"^{refusal}{text}$"):
+        parse_fault(BROKK_170, text)

@@ -1,15 +1,19 @@
 """The commands at a machine: their controllers, and the line that they print."""
 
+import os
+import signal
 import struct
+import threading
 
 import numpy as np
 import pytest
 from helpers_bus import BASELINE, HoldingOperator, Virtual, World, only
 
 from brokk_min.beyond.adaptation import valves
+from brokk_min.can.connection import open_bus
 from brokk_min.can.drive_log import read_frames
 from brokk_min.can.operator_input import Joystick
-from brokk_min.cli.operating import DriveMachine, find_controller, show, status
+from brokk_min.cli.operating import DriveMachine, Simulate, find_controller, show, status
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import BROKK_170
 
@@ -20,6 +24,27 @@ def test_find_controller__is_the_policy_or_the_pid_with_the_gains_beside_it(fold
     (folder / "gains.json").write_text("of other nets")  # which the policy does not need
     policy, nets = find_controller(BROKK_170, folder / "policy.npz", rl=True)
     assert isinstance(policy, Policy) and nets.joints == net.joints == policy.net.joints
+
+
+def test_machine__fails_on_request():
+    """The encoder of q3 is off; the others answer SYNC."""
+    came = set()
+
+    def listen(bus):
+        while bus.recv(20.0).id < 0x700:
+            pass  # until the machine runs: its heartbeat
+        bus.send(0x000, b"\1\0")
+        bus.send(0x080, b"")
+        came.update(frame.id for frame in (bus.recv(0.3) for _ in range(20)) if frame)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with open_bus("virtual", "faults") as bus:
+        thread = threading.Thread(target=listen, args=(bus,))
+        thread.start()
+        Simulate(interface="virtual", channel="faults", fault=("q3:off@0",))(BROKK_170)
+        thread.join()
+    nodes = (1, 2, 4, 5)
+    assert came == {*(0x180 + n for n in nodes), *(0x700 + n for n in nodes), 0x710}
 
 
 def test_status__says_what_stopped_it_and_what_is_in_the_way():
@@ -61,7 +86,7 @@ def test_drive_adapt__learns_on_the_bus_logs_keeps_and_begins_with_what_it_knew(
     printed = capsys.readouterr().out
     assert "driving" in printed and " s of motion" in printed
     world.drive.bus.flush()
-    frames = {f.id: f.data for f in read_frames(log) if 0x7F0 <= f.id < 0x7FE}
+    frames = {f.id: f.data for f in read_frames(log) if 0x7F0 <= f.id < 0x7FD}
     assert set(frames) == {0x7F0 + i for i in BROKK_170.driven}
     k, d = (of[0] for of in valves(controller.known))
     logged = np.array([struct.unpack("<hhhh", frames[key]) for key in sorted(frames)]) / 1e4

@@ -8,10 +8,11 @@ import sys
 import numpy as np
 import pytest
 from helpers_bus import START, ConstantCommand, HoldingOperator, World, raises, recording
-from helpers_faults import COMMAND, FAULTS, NOT_FOUND, delay, flood, foreign, freeze, measure
-from helpers_machines import obedient_net, pids
+from helpers_faults import COMMAND, FAULTS, NOT_FOUND, fail, flood, foreign, measure, stall
+from helpers_machines import DRIVEN, obedient_net, pids
 
 from brokk_min._files import SHIPPED
+from brokk_min.can import simulated_machine
 from brokk_min.can.canopen import valve_frame
 from brokk_min.can.operator_input import Script
 from brokk_min.env import reward
@@ -23,12 +24,14 @@ from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170
 
 
-@pytest.fixture
-def world():
+def started():
     """A constant command, an operator, and nodes that are started."""
     world = World(ConstantCommand(*COMMAND), HoldingOperator())
     world.drive.begin()
     return world
+
+
+world = pytest.fixture(started)
 
 
 def test_import__loads_no_library_that_is_not_needed():
@@ -90,10 +93,11 @@ def test_tick__survives_an_operator_that_fails_at_once(world):
     assert world.drive.gate.driving and world.drive.reason == ""
 
 
-def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
-    world.operator.enable, out, inputs = False, [], []
+def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later():
+    world, out, inputs = started(), [], []
+    world.operator.enable = False
     world.downward = recording(out)
-    world.bus.log_input = inputs.append
+    world.bus.log_tick = lambda entered, late: inputs.append(entered)
     assert world.drive.tick() and world.drive.reason == "tick late, or the clock was set"
     world.run(1.0)
     assert world.drive.gate.active_fault == ""
@@ -102,7 +106,7 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later(world):
     world.operator.enable, world.operator.v = True, (0.0, 0.0, 0.0)
     world.drive.tick()
     world.drive.tick()
-    assert inputs[-1] == world.drive.operator_input.pack() and len(inputs) == world.drive.ticks
+    assert inputs[-1] == world.drive.operator_input and len(inputs) == world.drive.ticks
     frames = [data for can_id, data in out if can_id == 0x210]
     assert [list(f[:5]) for f in frames] == [[0] * 5, [40, 0, 40, 40, 40]]
     assert [f[7] for f in frames] == [1, 1] and frames[1][5] == frames[0][5] + 1
@@ -149,7 +153,7 @@ def test_tick__finds_a_frozen_encoder_at_small_commands_too(node, counts, bound,
     world.sleep(0.0215)
     begun = world.time
     assert world.commands[1][-1].any()
-    freeze(world, node)
+    fail(world, node, "stuck")
     world.run(2.0)
     assert closes_within(world, begun, bound)
     assert world.drive.reason == f"fault: q{node}: frozen, or the joint does not move"
@@ -180,13 +184,12 @@ def test_tick__opens_no_valve_again_on_frames_of_any_identifier_and_length(world
     assert closes_within(world, begun, 0.175)
 
 
-@pytest.mark.parametrize(("low", "high", "found"), [(15, 15, 0), (25, 25, 1), (0, 60, 1)])
-def test_tick__finds_positions_later_than_20_ms(low, high, found, world):
-    """Constantly, or by chance between two bounds [ms]."""
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize(("late", "found"), [(0.015, 0), (0.025, 1)])
+def test_tick__finds_positions_later_than_20_ms(late, found, world, monkeypatch):
+    monkeypatch.setattr(simulated_machine, "DELAY", late)
     world.run(0.8)
     begun = world.time
-    delay(world, 3, lambda: rng.uniform(low, high) / 1e3)
+    fail(world, 3, "delayed")
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
     assert closes_within(world, begun, 0.175) == bool(found)
@@ -240,6 +243,19 @@ def test_wait__keeps_an_absolute_grid_and_skips_missed_ticks(world):
     assert np.diff(ticks).min() > 0.3
     assert np.diff(ticks)[[40, 90]] == pytest.approx([2.6, 5.2], abs=0.25)
     assert round(ticks[-1]) == 119 + 5  # none was made up for
+
+
+def test_wait__forgets_what_came_before_a_missed_tick():
+    """Samples of the history are a tick apart: it begins anew, with the arm at rest."""
+    world = started()
+    world.run(1.0)
+    moving = world.drive.history[0]
+    assert moving[DRIVEN, 1].any(axis=1).all() and moving[DRIVEN, 2].any(axis=1).all()
+    stall(world, 0.11)
+    world.drive.tick()
+    world.drive.tick()
+    history = world.drive.history[0]
+    assert (history[:, 0] == history[:, 0, -1:]).all() and not history[:, 1:].any()
 
 
 # --- endings -------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ who imported it runs the wrong code.
 import importlib
 import inspect
 import itertools
+import re
 import runpy
 import sys
 import types
@@ -120,3 +121,11 @@ def finds_an_error(test: Any) -> bool:
 def test_planted_error__is_found(test: str, module: str, right: str, wrong: str) -> None:
     with planted(module, right, wrong):
         assert finds_an_error(copy_of(test)), f"{test} passes with {wrong!r} in {module}.py"
+
+
+def test_planted_errors__are_in_each_method_file_that_computes():
+    """Settings are numbers alone; the README lists the method files."""
+    readme = (TABLE.parents[2] / "README.md").read_text()
+    listed = set(re.findall(r"\| \[`(\w+)\.py`\]\(brokk_min/\w+\.py\) \|", readme))
+    assert {"machine", "hw"} < listed
+    assert listed - {"__init__", "settings"} <= {name for _, name, *_ in planted_errors()}
