@@ -58,9 +58,8 @@ class DriveMachine(Command):
     log: Path | None = None  # Also log every frame here, candump format.
 
     def __call__(self, machine: Machine) -> None:
-        self.writes(self.log)
-        if self.valves and not self.valves.exists():
-            self.writes(self.valves)
+        new = None if self.valves and self.valves.exists() else self.valves
+        self.writes(self.log, new, reads=[Path(self.command)])
         learns = self.adapt or self.shadow
         check(learns or not self.valves, "--valves", "--adapt or --shadow with it", self.valves)
         check(self.shadow or not self.sync, "--sync", "--shadow with it", "a drive that sends SYNC")

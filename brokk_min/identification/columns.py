@@ -6,13 +6,14 @@ changes its sign.
 """
 
 import math
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brokk_min._files import brief, load_arrays, numbers, read_csv
+from brokk_min._files import brief, numbers, read_csv
 from brokk_min.identification.ros_logs import read_ros
 from brokk_min.machine import Array, require
 
@@ -49,13 +50,16 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
     `topics` are those of a recording of ROS. A table without `run` is one recording, by the name
     of its file. ValueError: no such file or column, or the row of what cannot be a value.
     """
-    table: dict[str, Any]
     if path.suffix.lower() == ".csv":
-        table = dict(read_csv(path))
-    elif path.suffix.lower() == ".npz":
-        table = load_arrays(path)[1]
-    else:
-        table = read_ros(path, *topics)
+        return find_columns(path, read_csv(path), mapped)
+    if path.suffix.lower() == ".npz":
+        with np.load(path, allow_pickle=False) as table:  # of which only what is wanted is read
+            return find_columns(path, table, mapped)
+    return find_columns(path, read_ros(path, *topics), mapped)
+
+
+def find_columns(path: Path, table: Mapping[str, Any], mapped: Mapped) -> dict[str, Any]:
+    """The columns of `load_table` in a table of any others."""
     joints = dict.fromkeys(name[2:] for name in (*table, *mapped) if name.startswith("u_"))
     joints |= dict.fromkeys(name[2:] for name in mapped if name.startswith("q_"))
     require(len(joints) > 0, "columns", "u_<joint> (--map u_NAME=COLUMN:UNIT)", brief(list(table)))
