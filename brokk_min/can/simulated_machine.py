@@ -13,7 +13,7 @@ from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Frame, checksum
 from brokk_min.can.connection import open_bus, stop_signals
 from brokk_min.machine import Array, Machine
 
-STEP = 0.005  # s, of the plant
+STEP = 0.005  # s, of watchdog, heartbeats and the analytic plant
 PRE_OPERATIONAL = 127  # NMT state after each NMT command but the start
 Outgoing = list[tuple[int, bytes]]  # identifiers and data
 
@@ -21,15 +21,20 @@ Outgoing = list[tuple[int, bytes]]  # identifiers and data
 class SimulatedMachine:
     """CiA 406 encoders, a valve controller by the rules of docs/hardware.md, and a plant.
 
-    It starts at angles `q` [rad] (n,) at the time `now` [s]. ValueError: see `canopen.check_bus`.
+    It starts at angles `q` [rad] (n,) at the time `now` [s]. A plant makes a step every `period`
+    [s]; one whose step is a tick makes it with the SYNC, so that a command holds from one to the
+    next. ValueError: see `canopen.check_bus`.
     """
 
-    def __init__(self, machine: Machine, q: ArrayLike, now: float, plant: Plant = PLANT) -> None:
+    def __init__(
+        self, machine: Machine, q: ArrayLike, now: float, plant: Plant = PLANT, period: float = STEP
+    ) -> None:
         canopen.check_bus(machine)
-        self.machine, self.plant = machine, plant
-        self.fine = replace(machine, rate=1 / STEP)  # of which a tick is one step
-        self.state = plant.reset(self.fine, np.array(q, float))
+        self.machine, self.plant, self.period = machine, plant, period
+        self.stepped = replace(machine, rate=1 / period)  # of which a tick is one step
+        self.state = plant.reset(self.stepped, np.array(q, float))
         self.start = now
+        self.moves = now + period  # time of the plant's next step
         self.steps = self.heartbeats = 0
         *self.encoders, self.controller = canopen.node_numbers(machine)
         self.nmt = dict.fromkeys([*self.encoders, self.controller], PRE_OPERATIONAL)
@@ -45,7 +50,7 @@ class SimulatedMachine:
 
     @property
     def next_step(self) -> float:
-        """Time of the next plant step [s]."""
+        """Time of the next look at watchdog, heartbeats and plant [s]."""
         return self.start + (self.steps + 1) * STEP
 
     def advance(self, now: float) -> Outgoing:
@@ -54,17 +59,26 @@ class SimulatedMachine:
         while (then := self.next_step) <= now:
             if self.enabled and then - self.valid >= WATCHDOG:
                 self._trip(f"no valve frame for {WATCHDOG} s")
-            self.state = self.plant.step(self.fine, self.state, self.u)
+            if then > self.moves - STEP / 2:
+                self._move()
             self.steps += 1
             if then >= self.start + (self.heartbeats + 1) * canopen.HEARTBEAT_PERIOD:
                 self.heartbeats += 1
                 out += [(canopen.HEARTBEAT + node, bytes([x])) for node, x in self.nmt.items()]
         return out
 
+    def _move(self) -> None:
+        self.state = self.plant.step(self.stepped, self.state, self.u)
+        self.moves += self.period
+
     def receive(self, frame: Frame) -> Outgoing:
         """Take in one frame; frames to answer with."""
         node = frame.id - canopen.SDO_REQUEST
         if frame.id == canopen.SYNC:
+            if self.period > STEP:
+                if frame.time > self.moves - self.period / 2:
+                    self._move()
+                self.moves = frame.time + self.period
             if self.enabled and self.waiting:
                 self._trip("no valve frame between two SYNCs")
             self.waiting = True
@@ -129,7 +143,8 @@ def run_machine(machine: Machine, interface: str, channel: str, plant: Plant = P
     """Run a simulated machine on a bus until a signal; it prints why its valve controller stops."""
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:
-        simulated = SimulatedMachine(machine, start_pose(machine), bus.now(), plant)
+        period = STEP if plant is PLANT else machine.dt
+        simulated = SimulatedMachine(machine, start_pose(machine), bus.now(), plant, period)
         while not signals:
             frame = bus.recv(max(0.0, simulated.next_step - bus.now()))
             answers = simulated.advance(bus.now())

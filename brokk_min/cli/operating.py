@@ -31,7 +31,7 @@ class Simulate(Command):
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped every 5 ms.
+    plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped once a tick.
 
     def __call__(self, machine: Machine) -> None:
         print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
@@ -198,5 +198,10 @@ class Export(Command):
         self.writes(self.out)
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # not on what is not needed here
         warnings.filterwarnings("ignore", category=FutureWarning, module="copyreg")  # torch's own
-        export_onnx(self.out, load_policy(self.policy, machine))
+        policy = load_policy(self.policy, machine)
+        export_onnx(self.out, policy)
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
+        if policy.interface != "paper":
+            print(
+                "examples/run_onnx.py has the observation of train --paper, not that of this policy"
+            )
