@@ -23,7 +23,7 @@ LINE = re.compile(
     r" ?\((\d+\.\d+)\) +(\S+) +(?:[RT]X \S+ \S+ +)?([0-9A-Fa-f]{3})(?:#| +\[0?\d\] *)"
     r"((?:[0-9A-Fa-f]{2} ?){0,8})(?: *'.*')?(?: ([RT]))?\n"
 )
-OPERATOR = "operator"  # in place of a bus, of what `drive` notes beside the frames
+NOTES = ("operator", "valves", "shadow")  # no buses: what `drive` notes beside the frames
 OTHERS = (".asc", ".blf", ".trc", ".gz")  # that python-can reads
 
 
@@ -58,7 +58,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
 
 def one_bus(buses: dict[Any, None], bus: Any) -> None:
     """Note the bus of a frame; ValueError: frames of another one came before."""
-    if bus != OPERATOR:
+    if bus not in NOTES:
         buses[bus] = None
     wanted, got = "frames of one bus (grep those of one)", " and ".join(map(str, buses))
     require(len(buses) < 2, "log", wanted, got)

@@ -40,8 +40,8 @@ class Evaluate(Command):
         policies = {k: load_policy(path.with_name(f), machine) for k, f in files.items()}
         net = policies["rl"].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
-        controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
         commands, starts = self.task(machine)
+        controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
         if self.adapt:
             rows, motions = len(commands) * len(starts), adaptive.warm_up_motions(machine)
             controllers |= adaptive.cold_and_warm(

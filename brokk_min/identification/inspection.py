@@ -36,7 +36,7 @@ COARSE = 0.5  # s
 CLEAR = 0.2  # of the fastest expected motion: more is clear
 OPENS = 0.3  # of full command: it opens any valve
 RESTS = 0.1  # of the expected motion: less is rest
-RESTING = 0.1  # of the samples, in which a joint must rest to tell the command at rest
+RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
@@ -281,7 +281,7 @@ def stands_still(motion: Motion, model: Model, others: Motion) -> bool:
 def rest_of(motion: Motion) -> float:
     """The command while a joint rests, if it is clearly one, and not 0."""
     calm = reach(motion) < RESTS * np.abs(motion.velocity).max()
-    if calm.sum() <= max(RESTING * motion.counts.sum(), motion.rate):
+    if calm.sum() <= max(RESTING * motion.counts.sum(), LONG * motion.rate):
         return 0.0
     low, usual, high = np.quantile(motion.u[calm], (0.25, 0.5, 0.75))
     return float(usual) if high - low < COMMANDED < abs(usual) else 0.0
