@@ -9,7 +9,7 @@ A grid gives delay, lag and dead zones, and least squares give the gains. Sample
 recorded range do not count, because a joint that is pushed against its stop stands still.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -36,6 +36,7 @@ COARSE = 0.5  # s
 CLEAR = 0.2  # of the fastest expected motion: more is clear
 OPENS = 0.3  # of full command: it opens any valve
 RESTS = 0.1  # of the expected motion: less is rest
+STILL = 1.5  # s of clear commands without motion; in sound logs of ours up to 1.15
 RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
@@ -135,7 +136,7 @@ def inspect_joint(
         opposite=[recordings[i].name for i in rows if contradicts(each[i], model)],
         follows={},
         other=other if by.get(other, 0) > LEAST_EXPLAINED else "",
-        rest=rest_of(motion),
+        rest=rest_of(motion_of(list(log.recordings), j, rate, span)),
         one_size=one_size(u),
     )
 
@@ -243,8 +244,7 @@ def responses(motion: Motion, lag: tuple[int, float], zones: Array) -> Array:
 
 def expected_velocity(motion: Motion, model: Model) -> Array:
     """What the model says of a motion [rad/s] (T,), 0 where samples do not count."""
-    velocity = model.gains @ responses(motion, model.lag, model.zones) * motion.counts
-    return np.asarray(velocity)
+    return np.asarray(model.gains @ responses(motion, model.lag, model.zones) * motion.counts)
 
 
 def means(motion: Motion, values: ArrayLike, seconds: float) -> Array:
@@ -270,12 +270,18 @@ def reach(motion: Motion) -> Array:
 
 
 def stands_still(motion: Motion, model: Model, others: Motion) -> bool:
-    """Does a joint rest for a second in which the model expects clear motion, as in `others`?"""
+    """Does a joint rest while the model of `others` expects clear motion for `STILL` seconds?
+
+    Not in one piece, because a valve that was closed needs half of it to open.
+    """
     if not others.velocity.any():
         return bool(np.abs(motion.u).max() > OPENS)
-    expected = np.abs(means(motion, expected_velocity(motion, model), 1.0))
-    fast = np.abs(means(others, expected_velocity(others, model), 1.0)).max()
-    return bool(((reach(motion) < RESTS * expected) & (expected > CLEAR * fast)).any())
+    expected = np.abs(expected_velocity(motion, model))
+    clear = max(CLEAR * np.abs(expected_velocity(others, model)).max(), MOVED)  # rad/s
+    ends = reach(motion) < RESTS * clear  # of a second at rest
+    rests = np.convolve(ends, np.ones(round(motion.rate)))[-len(ends) :] > 0
+    seconds = np.bincount(np.cumsum(~rests), rests & (expected > clear)) / motion.rate
+    return bool(seconds.max() > STILL)
 
 
 def rest_of(motion: Motion) -> float:
@@ -305,107 +311,81 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
     for name, report in reports.items():
         wanted = f"u_{name}: expected positive commands to raise q_{name}"
         if report.sign < 0:
-            yield f"{wanted}, got falling angles (--map {name}=COLUMN:-1)"
+            yield f"{wanted}, got falling angles (--map {name}=COLUMN:-1, or :-deg)"
         if report.opposite:
             yield f"{wanted} in all recordings or in none, got some in {brief(report.opposite)}"
 
 
-def by_degrees(r: JointReport, joint: Joint) -> bool:
-    """Would the recorded range be that of the joint if it were in degrees, of whatever sign?"""
+Check = tuple[Any, str]  # what must be true for the words to be told, and these words
+
+
+def causes(name: str, r: JointReport) -> Iterator[Check]:
+    """Why commands do not explain a motion; the first that holds is the one to look at."""
+    told = f"motion at so many times the speed of others {r.follows}"
+    doubt = "is it an angle to the ground? Then take differences of both angles"
+    yield r.follows, f"q_{name}: expected rest without commands, got {told}: {doubt}"
+    got = f"got motion by u_{r.other}: are columns mixed up?"
+    yield r.other, f"{name}: expected motion by u_{name}, {got}"
+    got = f"steps of {r.step:.3g} rad (of the encoder, or noise): {r.explained:.0%} of single"
+    wanted = f"q_{name}: expected angles finer than the motion in a tick"
+    noise = r.coarse > max(r.explained + COARSER, LEAST_EXPLAINED)
+    yield noise, f"{wanted}, got {got} ticks and {r.coarse:.0%} of {COARSE} s are explained"
+    wanted = f"{name}: expected {LEAST_EXPLAINED:.0%} of its motion by its commands"
+    yield r.explained < LEAST_EXPLAINED, f"{wanted}, got {r.explained:.0%}"
+    wanted = f"{name}: expected motion within {LATEST} s of its commands"
+    yield r.delay > LATEST - 1e-9, f"{wanted}, got it later: another clock?"
+
+
+def lacks(name: str, r: JointReport) -> Iterator[Check]:
+    """What nets could not learn from a log."""
+    got = f"recordings in which it rests (engine or pump off, or blocked?): {brief(r.still)}"
+    wanted = f"{name}: expected commands to move it"
+    yield (
+        r.still and not r.other,
+        f"{wanted}, got {got}; the figures are those of the others, if any",
+    )
+    yield r.rest, f"u_{name}: expected 0 at rest, got {r.rest:.3g}"
+    wanted = f"u_{name}: expected commands of many sizes, because nets cannot guess what is between"
+    yield r.one_size, f"{wanted}, got one in each direction"
+    few = round(r.minutes, 1) < LEAST_MINUTES
+    yield few, f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}"
+
+
+def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
+    """Where a log contradicts the machine that it should be of."""
+    joint = machine.joints[machine.names.index(name)]
+    width, got = joint.q_max - joint.q_min, f"got {r.low:.2f} to {r.high:.2f}"
     low, high = np.deg2rad([r.low, r.high])
-    return min(outside(low, high, joint), outside(-high, -low, joint)) < BEYOND
+    turned = min(beyond(low, high, joint), beyond(-high, -low, joint)) < BEYOND * width
+    doubt = f"in degrees (--map {name}=COLUMN:deg, or -deg)" if turned else "another zero or joint"
+    outside = beyond(r.low, r.high, joint) > BEYOND * width
+    yield outside, f"q_{name}: expected {joint.q_min:g} to {joint.q_max:g}, {got}: {doubt}?"
+    narrow = r.high - r.low < LEAST_RANGE * width
+    yield narrow, f"{name}: expected {LEAST_RANGE:.0%} of its range or more, {got}"
+    apart = np.abs(np.subtract(r.dead_zone, joint.dead_zone)).max() > ZONE
+    worse = 1 - r.by_zones > WORSE * (1 - r.explained)
+    wanted = f"{name}: expected the machine's dead_zone {joint.dead_zone}"
+    explained = r.explained > LEAST_EXPLAINED
+    yield (
+        explained and apart and worse,
+        f"{wanted}, got ({r.dead_zone[0]:.2f}, {r.dead_zone[1]:.2f})",
+    )
+    speeds = joint.q_dot_up, joint.q_dot_down
+    ratio = np.array(r.fastest) / speeds
+    slow = (ratio < SLOWER) & (np.array(r.largest) > AT_LIMIT * machine.pwm_limit / PWM_MAX)
+    wanted = (
+        f"{name}: expected the machine's q_dot_up and q_dot_down {speeds} as the fastest motion"
+    )
+    fastest = f"({r.fastest[0]:.3g}, {r.fastest[1]:.3g})"
+    yield explained and (slow | (ratio > FASTER)).any(), f"{wanted}, got {fastest} rad/s"
+    memory = machine.history * machine.dt
+    wanted = f"history: expected more than delay and lag of {name}, {r.delay:.2f} and {r.tau:.2f} s"
+    yield explained and r.delay + r.tau > memory, f"{wanted}, got {memory:.2f} s"
 
 
-def outside(low: float, high: float, joint: Joint) -> float:
-    """How far a range goes beyond that of the joint, in parts of the latter."""
-    return max(joint.q_min - low, high - joint.q_max) / (joint.q_max - joint.q_min)
-
-
-# Of what a log lacks, all that holds is told. `r` is a report, `joint` the machine's.
-LACKS: list[tuple[Callable[[JointReport], Any], str]] = [
-    (
-        lambda r: r.still and not r.other,
-        "{name}: expected commands to move it, got recordings in which it rests (engine or pump "
-        "off, or against something?): {still}; if there are others, the figures are theirs",
-    ),
-    (lambda r: r.rest, "u_{name}: expected 0 at rest, got {rest:.3g}: a command has another zero"),
-    (
-        lambda r: r.one_size,
-        "u_{name}: expected commands of many sizes, got one a direction: what lies between, and "
-        "dead zones, cannot be learned",
-    ),
-    (
-        lambda r: round(r.minutes, 1) < LEAST_MINUTES,
-        f"{{name}}: expected {LEAST_MINUTES:g} minutes, got {{minutes:.1f}}",
-    ),
-]
-# Of what a log says against its joint, the first that holds is told.
-CAUSES: list[tuple[Callable[[JointReport], Any], str]] = [
-    (
-        lambda r: r.follows,
-        "q_{name}: expected rest without commands, got motion at so many times the speed of others "
-        "{follows}: is it an angle to the ground? Then take differences of both angles",
-    ),
-    (
-        lambda r: r.other,
-        "{name}: expected motion by u_{name}, got motion by u_{other}: are columns mixed up?",
-    ),
-    (
-        lambda r: r.coarse > max(r.explained + COARSER, LEAST_EXPLAINED),
-        "q_{name}: expected angles finer than the motion in a tick, got steps of {step:.3g} rad "
-        "(of the encoder, or noise): {explained:.0%} of single ticks are explained, {coarse:.0%} "
-        f"of {COARSE} s",
-    ),
-    (
-        lambda r: r.explained < LEAST_EXPLAINED,
-        f"{{name}}: expected {LEAST_EXPLAINED:.0%} of its motion by its commands, got "
-        "{explained:.0%}",
-    ),
-    (
-        lambda r: r.delay > LATEST - 1e-9,
-        f"{{name}}: expected motion within {LATEST} s of its commands, got later: another clock?",
-    ),
-]
-# How machine and log differ: all that holds is told.
-DIFFERENCES: list[tuple[Callable[[JointReport, Joint, Machine], Any], str]] = [
-    (
-        lambda r, joint, _: outside(r.low, r.high, joint) > BEYOND and by_degrees(r, joint),
-        "q_{name}: expected {joint.q_min:g} to {joint.q_max:g}, got {low:.2f} to {high:.2f}: in "
-        "degrees (--map {name}=COLUMN:deg, or -deg)?",
-    ),
-    (
-        lambda r, joint, _: outside(r.low, r.high, joint) > BEYOND and not by_degrees(r, joint),
-        "q_{name}: expected {joint.q_min:g} to {joint.q_max:g}, got {low:.2f} to {high:.2f}: "
-        "another zero or joint?",
-    ),
-    (
-        lambda r, joint, _: r.high - r.low < LEAST_RANGE * (joint.q_max - joint.q_min),
-        f"{{name}}: expected {LEAST_RANGE:.0%} of its range or more, got {{low:.2f}} to "
-        "{high:.2f}",
-    ),
-    (
-        lambda r, joint, _: zones_differ(r, joint),
-        "{name}: expected the machine's dead_zone {joint.dead_zone}, got {zones} in the log",
-    ),
-    (
-        lambda r, joint, _: np.any(speed_ratio(r, joint) > FASTER),
-        "{name}: expected the machine's q_dot_up and q_dot_down, {joint.q_dot_up} and "
-        "{joint.q_dot_down}, as its fastest, got {speeds} rad/s in the log",
-    ),
-    (
-        lambda r, joint, m: np.any(
-            (speed_ratio(r, joint) < SLOWER)
-            & (np.array(r.largest) > AT_LIMIT * m.pwm_limit / PWM_MAX)
-        ),
-        "{name}: expected the machine's q_dot_up and q_dot_down, {joint.q_dot_up} and "
-        "{joint.q_dot_down}, at the command limit, got {speeds} rad/s in the log",
-    ),
-    (
-        lambda r, _, m: r.explained > LEAST_EXPLAINED and r.delay + r.tau > m.history * m.dt,
-        "history: expected to hold the delay and lag of {name}, {delay:.2f} and {tau:.2f} s, got "
-        "{machine.history} samples",
-    ),
-]
+def beyond(low: float, high: float, joint: Joint) -> float:
+    """How far a range goes beyond that of the joint [rad]."""
+    return max(joint.q_min - low, high - joint.q_max)
 
 
 def warnings(
@@ -419,31 +399,10 @@ def warnings(
     for name in log.joints:
         if name not in reports:
             yield f"{name}: expected commands in the log, got none"
-    joints = {joint.name: joint for joint in machine.joints} if machine else {}
     for name, r in reports.items():
-        pairs = {"zones": r.dead_zone, "speeds": r.fastest}
-        told = {key: "({:.3g}, {:.3g})".format(*pair) for key, pair in pairs.items()}
-        told |= r._asdict() | {"name": name, "still": brief(r.still), "machine": machine}
-        causes = [text for holds, text in CAUSES if holds(r)][:1]
-        lacks = [text for holds, text in LACKS if holds(r)]
-        joint = joints.get(name)
-        differs = []
-        if machine and joint:
-            differs = [text for holds, text in DIFFERENCES if holds(r, joint, machine)]
-        for text in (*causes, *lacks, *differs):
-            yield text.format(**told, joint=joint)
-
-
-def zones_differ(r: JointReport, joint: Joint) -> bool:
-    """Are the machine's dead zones others, and do they explain clearly less?"""
-    apart = np.abs(np.subtract(r.dead_zone, joint.dead_zone)).max() > ZONE
-    clear = 1 - r.by_zones > WORSE * (1 - r.explained)
-    return bool(apart and clear and r.explained > LEAST_EXPLAINED)
-
-
-def speed_ratio(r: JointReport, joint: Joint) -> Array:
-    """The log's fastest motions, of those of the machine, up and down."""
-    return np.array(r.fastest) / (joint.q_dot_up, joint.q_dot_down)
+        yield from [text for holds, text in causes(name, r) if holds][:1]
+        known = differences(name, r, machine) if machine else ()
+        yield from (text for holds, text in (*lacks(name, r), *known) if holds)
 
 
 def repeated(recordings: Sequence[Recording], others: Sequence[Recording]) -> list[str]:

@@ -91,7 +91,7 @@ def check_run(
         usual, limit = np.quantile(speeds, 0.9, axis=0), TOO_FAST * np.where(fastest, fastest, 1.0)
         for name, speed, most in zip(joints, usual, limit, strict=True):
             got = f"{speed:.3g} in {time[-1] - time[0]:.3g} s altogether"
-            doubt = f"another unit (--map time=COLUMN:h, or {name}=COLUMN:deg)?"
+            doubt = f"another unit (--map time=COLUMN:UNIT, or {name}=COLUMN:deg)?"
             wanted = f"speeds of q_{name} up to {most:.3g} rad/s"
             require(speed <= most, f"run {run}, column time", wanted, f"{got}: {doubt}")
 
