@@ -2,6 +2,7 @@
 
 import io
 import os
+import shutil
 import sys
 from typing import Any
 
@@ -31,6 +32,7 @@ COMMANDS: dict[str, Any] = {
     "replay": operating.Replay,
     "export": operating.Export,
 }
+NARROWEST = 20  # columns of a terminal
 LINES = "\n".join(f"  {name:10} {command.__doc__}" for name, command in COMMANDS.items())
 
 
@@ -38,11 +40,14 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command; errors are one line on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # an encoding that lacks a sign of ours
+    if shutil.get_terminal_size().columns < NARROWEST:  # help of tyro would never end
+        os.environ["COLUMNS"] = str(NARROWEST)
     name, *options = (sys.argv[1:] if arguments is None else arguments) or [""]
-    if name in ("-h", "--help", "--version"):
-        print(f"brokk_min {__version__}" if name == "--version" else f"{__doc__}\n{LINES}")
-        return 0
     try:
+        if name in ("-h", "--help", "--version"):
+            print(f"brokk_min {__version__}" if name == "--version" else f"{__doc__}\n{LINES}")
+            sys.stdout.flush()
+            return 0
         check(name in COMMANDS, "COMMAND", f"one of {', '.join(COMMANDS)}", repr(name))
         command = tyro.cli(
             COMMANDS[name],
@@ -52,6 +57,10 @@ def main(arguments: list[str] | None = None) -> int:
             config=(tyro.conf.FlagCreatePairsOff,),
         )
         command(command.find_machine())
+        sys.stdout.flush()
+    except BrokenPipeError:  # as of `| head`, which has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except (ValueError, OSError, MemoryError, ImportError) as error:
         print(f"brokk-min: {brief(error, longest=10_000)}", file=sys.stderr)
         return 2 if isinstance(error, WrongUse) else 1

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from brokk_min.machine import require
 
+LARGEST = 2**26  # bytes of the arrays of a policy or net, assumed; ours have a few MB
+NEW: set[Path] = set()  # files of the running command that must not be there before it writes them
 # a folder for each machine: policies, gains, starts and table of `make reproduce`
 SHIPPED = Path(__file__).parent / "shipped"
 
@@ -36,7 +38,8 @@ def require_package(package: str, extra: str) -> Any:
 def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """A temporary file, text in UTF-8, that replaces `path` if the block ends without an error.
 
-    It has the mode of the file that it replaces. ValueError: `path` is a folder or a device.
+    It has the mode of the file that it replaces. ValueError: `path` is a folder or a device, or is
+    in `NEW` and another program has written it meanwhile; then ours lies beside it.
     """
     path = Path(path)
     require(path.is_file() or not path.exists(), str(path), "a regular file", "another kind")
@@ -47,7 +50,12 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
             with suppress(OSError):  # no file is there yet, or a disk without modes
                 shutil.copymode(target, temporary)
             yield file
+        if target in NEW and target.exists():
+            ours = target.with_name(f"{target.stem}-{os.getpid()}{target.suffix}")
+            os.replace(temporary, ours)
+            require(False, str(path), "no file, as at the start", f"one; the new one is {ours}")
         os.replace(temporary, target)
+        NEW.discard(target)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
@@ -57,7 +65,7 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON with all digits; ValueError for nan and inf."""
-    with whole_file(path, "w") as file:
+    with expected(path, "finite numbers to write"), whole_file(path, "w") as file:
         json.dump(value, file, indent=1, allow_nan=False)
         file.write("\n")
 
@@ -144,16 +152,21 @@ def save_arrays(path: Path, kind: str, header: Mapping[str, Any], **arrays: Any)
         np.savez_compressed(file, header=text, **arrays)
 
 
-def load_arrays(path: Path, kind: str = "") -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def load_arrays(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Header and arrays of an `.npz`; nothing in it is executed.
 
-    ValueError: no readable `.npz`, or not of this `kind`; without a kind it may have no header.
+    The header is read first, and the arrays if they are those of this `kind`. ValueError: no
+    readable `.npz`, another kind, unpacked too large, or an array of anything but finite numbers.
     """
-    with expected(path, "a readable .npz file"):
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = dict(archive)
-        header = json.loads(str(arrays.pop("header", "{}")))
-        got = header.pop("kind", None)
+    with expected(path, "a readable .npz file"), np.load(path, allow_pickle=False) as archive:
+        size = sum(entry.file_size for entry in archive.zip.infolist())
+        require(size <= LARGEST, str(path), f"at most {LARGEST:,} bytes", f"{size:,}")
+        header = json.loads(str(archive["header"])) if "header" in archive else {}
         wanted = f"{kind} (if it is older: train or fit again)"
-        require(kind in ("", got), str(path), wanted, brief(got))
+        got = header.pop("kind", None)
+        require(got == kind, str(path), wanted, brief(got))
+        arrays = {name: archive[name] for name in archive if name != "header"}
+        for name, array in arrays.items():
+            numbers = array.dtype.kind in "fiu" and np.isfinite(array)
+            require(bool(np.all(numbers)), f"{path}: {name}", "finite numbers", brief(array))
         return header, arrays

@@ -5,7 +5,7 @@ hydraulics of the plant that stands in for it. The numbers of `BROKK_170` come f
 are assumed (not the maker's data), or tuned (by our runs).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -26,6 +26,24 @@ def require(fact: bool, field: str, wanted: str, got: Any) -> None:
     """
     if not fact:
         raise ValueError(f"{field}: expected {wanted}, got {got}")
+
+
+def python_numbers(value: Any, place: str = "") -> None:
+    """Make the numbers of a frozen dataclass Python's, because files cannot hold those of NumPy.
+
+    Arrays become tuples. ValueError, with `place` and field: no number, or not a finite one.
+    """
+    for field in fields(value):
+        found = getattr(value, field.name)
+        plain = found.tolist() if isinstance(found, np.generic | np.ndarray) else found
+        if isinstance(plain, list | tuple):
+            plain = tuple(x.item() if isinstance(x, np.generic) else x for x in plain)
+        if field.type in (int, float):
+            kinds = int if field.type is int else int | float
+            wanted = "a whole number" if field.type is int else "a finite number"
+            fits = isinstance(plain, kinds) and bool(np.isfinite(plain))
+            require(fits, place + field.name, wanted, found)
+        object.__setattr__(value, field.name, plain)
 
 
 @dataclass(frozen=True)
@@ -52,6 +70,10 @@ class Joint:
     encoder_sign: Literal[-1, 1] = 1  # -1: the encoder counts down while q rises
     kind: Literal["revolute", "prismatic"] = "revolute"
     encoder_step: float = 1e-4  # m a count of a prismatic joint; others have `encoder_bits`
+
+    def __post_init__(self) -> None:
+        """ValueError: a field that is no number."""
+        python_numbers(self, f"{self.name}.")
 
 
 @dataclass(frozen=True)
@@ -126,6 +148,7 @@ class Machine:
 
     def __post_init__(self) -> None:
         """ValueError: what cannot be a machine, with the field, what is wanted and what it got."""
+        python_numbers(self)
         for j in self.joints:
             pair = np.shape(j.dead_zone) == (2,)
             require(pair, f"{j.name}.dead_zone", "a pair, up and down", j.dead_zone)

@@ -24,6 +24,8 @@ PARALLEL = 1e-5  # rad: axes count as parallel up to here, because URDFs round p
 COINCIDENT = 1e-10  # m
 POSES = 100  # at which tool positions are compared
 KINDS: tuple[Literal["revolute"], Literal["prismatic"]] = ("revolute", "prismatic")
+LONGEST = 50.0  # m, assumed: no machine has a longer link
+NEAR = 1e-3  # m: tools that are farther apart are not those of one machine
 FASTEST, SPEED = 10.0, 0.3  # rad/s or m/s, assumed: above the first, the second stands in
 
 
@@ -146,6 +148,8 @@ def limits(chain: Chain, i: int) -> tuple[float, float, float]:
     turns = not slides and np.isin(np.abs([low, high]).round(2), [3.14, 6.28]).any()
     if turns or not usable:
         warn(f"{name}: the limits {low:g} to {high:g} look like placeholders: measure its range")
+    elif not slides and max(-low, high) > 2 * np.pi:
+        warn(f"{name}: the limits {low:g} to {high:g} rad look like degrees")
     if not usable:
         low, high = (0.0, 1.0) if slides else (-np.pi, np.pi)
     if not 0 < speed < FASTEST:
@@ -161,7 +165,13 @@ def make_machine(chain: Chain) -> Machine:
         low, high, speed = limits(chain, i)
         name, kind = chain.model.names[chain.joints[i]], KINDS[chain.slides[i]]
         row = a, alpha, d, theta, low, high, speed, speed, i + 1
+        if max(abs(a), abs(d)) > LONGEST:
+            warn(f"{name}: its link of {max(abs(a), abs(d)):g} m looks like millimetres")
         joints.append(Joint(name, True, *row, kind=kind))
+    last = joints[-1]
+    if last.kind == "revolute" and abs(last.a) < COINCIDENT:
+        warn(f"{last.name}: cannot move the tool, which lies on its axis: it is not driven")
+        joints[-1] = replace(last, driven=False)
     own = {"name": chain.model.name, "q_start": (), "hydraulics": None}
     return replace(BROKK_170, joints=tuple(joints), **own)
 
@@ -185,6 +195,8 @@ def main(path: str, base: str, tool: str) -> None:
     chain = read_chain(Path(path), base, tool)
     machine = make_machine(chain)
     difference = largest_difference(chain, machine)
+    wanted = f"a tool where Pinocchio has it (has each joint an axis?), at most {NEAR} m apart"
+    require(difference < NEAR, path, wanted, f"{difference:.2g} m")
     print(f"tools are at most {difference:.1e} m apart at {POSES} random poses", file=sys.stderr)
     print("from brokk_min.machine import Joint, Machine\n")
     print(f"# The base frame is that of link {base!r}, moved by {base_origin(chain).tolist()} m.")

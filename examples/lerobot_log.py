@@ -20,28 +20,34 @@ ANGLES, COMMANDS = "observation.state", "action"
 COLUMNS = [ANGLES, COMMANDS, "timestamp", "episode_index"]
 
 
-def joint_names(dataset: Path) -> list[str]:
-    """The names of the angles, or joint_0, joint_1, ...; SystemExit: another format."""
+def joint_names(dataset: Path) -> tuple[list[str], list[str]]:
+    """Names of angles and commands, or joint_0, joint_1, ...; SystemExit: another format."""
     info = json.loads((dataset / "meta" / "info.json").read_text(encoding="utf-8"))
     shapes = [info["features"].get(key, {}).get("shape") for key in (ANGLES, COMMANDS)]
     if not info["codebase_version"].startswith("v3") or not shapes[0] or shapes[0] != shapes[1]:
         got = f"{info['codebase_version']}, {shapes}"
         raise SystemExit(f"{dataset}: expected v3, {ANGLES} and {COMMANDS} of one shape, got {got}")
-    names = info["features"][ANGLES].get("names")
-    names = next(iter(names.values())) if isinstance(names, dict) else names
-    names = names or [f"joint_{i}" for i in range(shapes[0][0])]
-    return [name.removesuffix(".pos") for name in names]
+    both = []
+    for key in (ANGLES, COMMANDS):
+        names = info["features"][key].get("names")
+        names = next(iter(names.values())) if isinstance(names, dict) else names
+        names = names or (both[0] if both else [f"joint_{i}" for i in range(shapes[0][0])])
+        both.append([name.removesuffix(".pos") for name in names])
+    angles, commands = both
+    if sorted(angles) != sorted(commands):
+        raise SystemExit(f"{dataset}: expected {COMMANDS} of {angles}, got {commands}")
+    return angles, commands
 
 
 def main(dataset: str, out: str) -> None:
     """Read all episodes, and write them as one table."""
-    names = joint_names(Path(dataset))
+    names, commands = joint_names(Path(dataset))
     files = sorted(Path(dataset, "data").glob("*/*.parquet"))
     tables = [parquet.read_table(file, columns=COLUMNS).to_pydict() for file in files]
     q, u, time, episode = (np.array([x for t in tables for x in t[key]]) for key in COLUMNS)
     columns = {"run": np.char.add("episode_", episode.astype(str)), "time": time}
     for i, name in enumerate(names):
-        columns |= {f"u_{name}": u[:, i], f"q_{name}": q[:, i]}
+        columns |= {f"u_{name}": u[:, commands.index(name)], f"q_{name}": q[:, i]}
     with whole_file(Path(out)) as file:
         np.savez_compressed(file, **columns)
     print(f"{out}: {len(np.unique(episode))} episodes of {', '.join(names)}")

@@ -7,9 +7,10 @@ STORE = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 JOINTS = ["boom", "wheel", "arm"]
 
 
-def joint_state(names, position=(), velocity=()):
+def joint_state(names, position=(), velocity=(), stamp=0.0):
     types = STORE.types
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    seconds, parts = divmod(round(stamp * 1e9), 10**9)
+    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=parts)
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
     arrays = (np.array(x, float) for x in (position, velocity, ()))
     return types["sensor_msgs/msg/JointState"](header, list(names), *arrays)

@@ -1,7 +1,9 @@
 """Files: written and read again; any bytes are read or refused in one line; whole or not at all."""
 
 import errno
+import io
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -77,6 +79,50 @@ def test_load_policy__refuses_a_file_without_any_one_of_its_fields(tmp_path):
             with pytest.raises(ValueError, match=r"^\S+p\.npz: expected [^\n]+, got .*" + name):
                 load_policy(path, BROKK_170)
             place[name] = value
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("layer_6", np.full((64, 4), np.nan), "layer_6: expected finite numbers"),
+        ("layer_6", np.full((64, 4), "0.1"), "layer_6: expected finite numbers"),
+        ("layer_2", np.zeros((255, 128)), "layer_2: expected an array .64, 64., got .255, 128."),
+        ("layer_7", np.zeros(1), "layer_7: expected an array .4,., got .1,."),
+        ("output_low", np.zeros(1), "output_low: expected a row for each of 4 joints, got .1,."),
+        ("other", np.zeros(2**24), "expected at most 67,108,864 bytes, got 13"),
+    ],
+)
+def test_load_policy__names_the_array_that_is_wrong(tmp_path, name, array, message):
+    path = tmp_path / "p.npz"
+    save_policy(path, random_policy("paper"))
+    header, arrays = files.load_arrays(path, KIND)
+    files.save_arrays(path, KIND, header, **arrays | {name: array})
+    with pytest.raises(ValueError, match=rf"^\S+p\.npz: {message}"):
+        load_policy(path, BROKK_170)
+
+
+def test_load_arrays__reads_the_header_first(tmp_path):
+    """An array that claims 8 EB is not touched in a file of another kind."""
+    head = io.BytesIO()
+    shape = {"descr": "<f8", "fortran_order": False, "shape": (2**60,)}
+    np.lib.format.write_array_header_1_0(head, shape)
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("x.npy", head.getvalue())
+    with pytest.raises(ValueError, match=r"expected policy 8 .*, got None"):
+        files.load_arrays(tmp_path / "x.npz", "policy 8")
+
+
+def test_whole_file__keeps_what_another_program_wrote_meanwhile_and_the_new_file_beside(tmp_path):
+    path = tmp_path / "y.json"
+    files.NEW.add(path)
+    path.write_text("theirs")
+    with pytest.raises(ValueError, match=r"y\.json: expected no file, as at the start, got one;"):
+        files.write_json(path, {"x": 1})
+    (ours,) = {*tmp_path.iterdir()} - {path}
+    assert path.read_text() == "theirs" and json.loads(ours.read_text()) == {"x": 1}
+    path.unlink()
+    files.write_json(path, {"x": 2})
+    files.write_json(path, {"x": 3})  # its own file
 
 
 def test_whole_file__leaves_the_old_file_and_no_other_if_writing_fails(tmp_path):

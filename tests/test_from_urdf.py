@@ -86,6 +86,23 @@ def test_rounded_right_angles__count_as_parallel(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("joint", "index", "value", "told"),
+    [
+        (2, 6, 35, "boom: the limits -1.1 to 35 rad look like degrees"),
+        (3, 2, "1800 0 0", "boom: its link of 1800 m looks like millimetres"),
+        (6, 2, "0.1 -0.45 0.2", "bucket: cannot move the tool, which lies on its axis"),
+    ],
+)
+def test_what_looks_like_an_error_of_an_exporter__is_told(
+    tmp_path, capsys, joint, index, value, told
+):
+    rows = [list(row) for row in EXCAVATOR]
+    rows[joint][index] = value
+    machine, found = printed(urdf(rows), tmp_path, capsys)
+    assert told in found and machine.joints[-1].driven == ("bucket" not in told)
+
+
+@pytest.mark.parametrize(
     ("old", "new", "tool", "message"),
     [
         ('"0 0 1"', '"0 0 -1"', "edge", "slew: expected an axis that points up from chassis"),

@@ -14,11 +14,11 @@ from examples.lerobot_log import main
 NAMES = ["boom.pos", "arm.pos"]
 
 
-def write_dataset(folder, names, version="v3.0"):
+def write_dataset(folder, names, version="v3.0", actions=None):
     """Two episodes of 30 rows in two files; the second one continues in the second file."""
     (folder / "meta").mkdir(parents=True)
     feature = {"dtype": "float32", "shape": [2], "names": names}
-    features = {"observation.state": feature, "action": feature}
+    features = {"observation.state": feature, "action": feature | {"names": actions or names}}
     info = {"codebase_version": version, "fps": 20, "features": features}
     (folder / "meta" / "info.json").write_text(json.dumps(info))
     rng = np.random.default_rng(0)
@@ -44,6 +44,16 @@ def test_main__writes_each_episode_as_a_recording(tmp_path, names, capsys):
     assert [one.name for one in log.recordings] == ["episode_0", "episode_1"]
     np.testing.assert_allclose(np.concatenate([one.q for one in log.recordings]), q)
     np.testing.assert_allclose(np.concatenate([one.u for one in log.recordings]), u)
+
+
+def test_main__finds_actions_by_their_names(tmp_path):
+    u, _ = write_dataset(tmp_path / "set", NAMES, actions=NAMES[::-1])
+    main(str(tmp_path / "set"), str(tmp_path / "log.npz"))
+    log = read_log(tmp_path / "log.npz", BROKK_170)
+    np.testing.assert_allclose(np.concatenate([one.u for one in log.recordings]), u[:, ::-1])
+    write_dataset(tmp_path / "other", NAMES, actions=["boom.pos", "x"])
+    with pytest.raises(SystemExit, match=r"expected action of \['boom', 'arm'\], got .*'x'"):
+        main(str(tmp_path / "other"), str(tmp_path / "log.npz"))
 
 
 def test_main__refuses_another_version(tmp_path):

@@ -16,7 +16,9 @@ from brokk_min.evaluation.preliminary import simulate
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import PWM_MAX
+from examples.mini_excavator import MINI_EXCAVATOR as MINI
 from examples.mujoco_brokk import PLANT, MujocoBrokk, build
+from examples.own_mjcf import PLANT as OWN
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "mujoco_brokk.py"
 LOW, HIGH = M.column("q_min"), M.column("q_max")
@@ -91,3 +93,24 @@ def test_film__is_written_or_says_that_there_is_no_opengl(tmp_path):
     else:
         with Image.open(out) as pictures:
             assert pictures.size == (960, 360) and pictures.n_frames > 4
+
+
+def test_own_mjcf__has_the_geometry_of_its_machine_and_obeys():
+    """Machines do not depend on those beside them, and a tick is a tick."""
+    find_plant(f"{EXAMPLE.with_name('own_mjcf.py')}:PLANT", MINI)
+    low, high = MINI.column("q_min"), MINI.column("q_max")
+    for q in np.random.default_rng(0).uniform(low, high, (20, MINI.n)):
+        OWN.data.qpos[:] = q
+        mujoco.mj_forward(OWN.model, OWN.data)
+        tool = tool_position(forward_kinematics(MINI, q))
+        np.testing.assert_allclose(OWN.data.site("tool").xpos, tool, atol=1e-9)
+    u = 0.5 * np.eye(MINI.n)
+    state = OWN.step(MINI, OWN.reset(MINI, np.tile((low + high) / 2, (MINI.n, 1))), u)
+    for i in range(MINI.n):
+        alone = OWN.step(MINI, OWN.reset(MINI, (low + high) / 2), u[i])
+        np.testing.assert_array_equal(alone.q, state.q[i])
+    for _ in range(25):
+        before, state = state, OWN.step(MINI, state, u)
+    speed = np.diag(state.q - before.q) * MINI.rate
+    opening = (0.5 - 0.12) / (1 - 0.12)
+    np.testing.assert_allclose(speed, opening * MINI.column("q_dot_up"), rtol=0.15)

@@ -111,7 +111,7 @@ def check_bus(machine: Machine) -> None:
         fits = joint.kind == "revolute" and width < 6.18  # less than a turn
         got = f"{joint.kind}, {width:.2f}"
         require(fits, joint.name, "revolute, with a range below 6.18 rad, on a bus", got)
-    slowest = 1.5 / WATCHDOG  # Hz, because a tick may be late by half
+    slowest = 1.8 / WATCHDOG  # Hz, because a tick may be late by half, and frames need time, too
     require(machine.rate >= slowest, "rate", f"{slowest:g} Hz or more (watchdog)", machine.rate)
 
 

@@ -4,7 +4,7 @@ import re
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,11 +17,13 @@ from brokk_min.identification.readings import FASTER, NOISE
 from brokk_min.machine import Array, Machine, require
 
 # (time) bus identifier#data direction, of a data frame with 11 bits; T: the program sent it. On a
-# terminal candump prints (time)  bus  identifier   [length]  data.
+# terminal candump prints (time)  bus  identifier   [length]  data; with -x RX - - before the
+# identifier, with -a the letters of the data after it, with -8 two digits of the length.
 LINE = re.compile(
-    r" ?\((\d+\.\d+)\) +\S+ +([0-9A-Fa-f]{3})(?:#| +\[\d\] *)((?:[0-9A-Fa-f]{2} ?){0,8})"
-    r"(?: ([RT]))?\n"
+    r" ?\((\d+\.\d+)\) +(\S+) +(?:[RT]X \S+ \S+ +)?([0-9A-Fa-f]{3})(?:#| +\[0?\d\] *)"
+    r"((?:[0-9A-Fa-f]{2} ?){0,8})(?: *'.*')?(?: ([RT]))?\n"
 )
+NOTES = ("operator", "timing", "valves", "shadow")  # no buses: what `drive` notes beside the frames
 OTHERS = (".asc", ".blf", ".trc", ".gz")  # that python-can reads
 
 
@@ -29,20 +31,37 @@ def read_frames(path: Path) -> Iterator[Frame]:
     """The data frames of a log with 11 bits, one by one, because a day of driving has millions.
 
     Other frames are left out, and a last line without its newline: the program that wrote it was
-    killed. ValueError: no such log, or a line without a time.
+    killed. ValueError: no such log, frames of two buses, a line without a time, or none understood.
     """
+    buses: dict[Any, None] = {}
     if Path(path).suffix.lower() in OTHERS:
         reader = require_package("can", "hw").LogReader
         with expected(path, "a log that python-can reads"), reader(path) as messages:
-            yield from (frame for frame in map(plain_frame, messages) if frame.id >= 0)
+            for message in messages:
+                one_bus(buses, message.channel)
+                if (frame := plain_frame(message)).id >= 0:
+                    yield frame
         return
+    strange = ""
     with expected(path, "a candump log"), open(path, encoding="ascii") as file:
         for row, line in enumerate(file, 1):
             wanted = "(time) bus identifier#data, as candump -l writes"
             require(line.lstrip().startswith("("), f"row {row}", wanted, brief(line))
             if match := LINE.fullmatch(line):
-                time, can_id, data, direction = match.groups()
+                time, bus, can_id, data, direction = match.groups()
+                one_bus(buses, bus)
                 yield Frame(float(time), int(can_id, 16), bytes.fromhex(data), direction == "T")
+            elif line.endswith("\n"):
+                strange = strange or f"row {row}: {brief(line)}"
+        require(bool(buses) or not strange, str(path), "data frames of 11 bits", strange)
+
+
+def one_bus(buses: dict[Any, None], bus: Any) -> None:
+    """Note the bus of a frame; ValueError: frames of another one came before."""
+    if bus not in NOTES:
+        buses[bus] = None
+    wanted, got = "frames of one bus (grep those of one)", " and ".join(map(str, buses))
+    require(len(buses) < 2, "log", wanted, got)
 
 
 class Telemetry(NamedTuple):

@@ -20,7 +20,7 @@ def read_commands(path: Path, machine: Machine) -> dict[str, Array]:
     """Goals (T, 3) [m/s] of each sequence of a CSV `sequence,time,vx,vy,vz` [s, m/s], by its name.
 
     Values hold until the next row; the last row of a sequence is its end. ValueError: no such
-    table, or rows below a tick apart.
+    table, rows below a tick apart, or goals faster than the machine's tool speed.
     """
     names = ("time", "vx", "vy", "vz")
     table = read_csv(path, "sequence", *names)
@@ -35,16 +35,17 @@ def read_commands(path: Path, machine: Machine) -> dict[str, Array]:
         tick = np.arange(round(time[-1] * machine.rate))
         row = np.searchsorted(time, tick / machine.rate + 1e-6, "right") - 1
         goals[name] = velocity[row]
+        fastest = float(np.linalg.norm(goals[name], axis=-1).max())
+        slow = fastest <= machine.tool_speed * (1 + 1e-9)
+        wanted = f"at most tool_speed, {machine.tool_speed} m/s"
+        require(slow, f"{path}: sequence {name}", wanted, f"{fastest:.3g} m/s")
     return goals
 
 
 class Script:
-    """Velocity goals (T, 3) [m/s] one by one; ValueError: faster than the machine's tool speed."""
+    """Velocity goals (T, 3) [m/s] one by one."""
 
     def __init__(self, machine: Machine, goals: Array) -> None:
-        fastest = float(np.linalg.norm(goals, axis=-1).max())
-        slow = fastest <= machine.tool_speed * (1 + 1e-9)
-        require(slow, "command", f"at most {machine.tool_speed} m/s", f"{fastest:.3g} m/s")
         self.goals = goals
         self.tick = 0
         self.pressed = False

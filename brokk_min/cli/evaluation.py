@@ -31,17 +31,17 @@ class Evaluate(Command):
     seed: int = 0  # Of the noise, and of what is drawn and tuned.
 
     def __call__(self, machine: Machine) -> None:
-        self.writes(self.json, self.save_gains)
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         check(self.seed >= 0, "--seed", "0 or more", self.seed)
         path, gains = default_policy(machine, self.policy)
         gains = None if self.save_gains else gains
+        self.writes(self.json, self.save_gains, reads=[path, gains])
         files = {"rl": path.name} if self.policy else POLICIES
         policies = {k: load_policy(path.with_name(f), machine) for k, f in files.items()}
         net = policies["rl"].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
-        controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
         commands, starts = self.task(machine)
+        controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
         if self.adapt:
             rows, motions = len(commands) * len(starts), adaptive.warm_up_motions(machine)
             controllers |= adaptive.cold_and_warm(
@@ -49,13 +49,13 @@ class Evaluate(Command):
             )
         runs, _ = metrics.evaluate(machine, controllers, commands, starts, self.seed, plant)
         runs = [run | {"kind": "file"} for run in runs] if self.starts else runs
+        print(table(runs))
         if self.json:
             meta = {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
             meta["commands"] = str(self.commands or "own")
             meta["starts"] = str(self.starts or self.num_starts)
             meta |= metrics.metadata(machine, self.seed)
             write_json(self.json, {"meta": meta, "runs": runs})
-        print(table(runs))
 
     def task(self, machine: Machine) -> tuple[list[sequences.Commands], Array]:
         """Velocity sequences and start poses of files, or the machine's own."""

@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
-from brokk_min._files import expected, require_package, write_json
+from brokk_min._files import brief, expected, require_package, write_json
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.can.drive_log import log_for_fit, read_frames, timing
 from brokk_min.cli.options import Command, check, check_settings, find_plant
@@ -85,7 +85,7 @@ class Inspect(ReadsLogs):
         from brokk_min.identification import inspection, validation, valve_report
 
         log, known = self.read_logs(self.logs, machine)
-        reports = inspection.inspect(log)
+        reports = inspection.inspect(log, known)
         warnings, scores = [*inspection.warnings(log, reports, known)], {}
         if self.net:
             net, window = load_net(self.net), machine.velocity_samples
@@ -135,22 +135,27 @@ class Fit(ReadsLogs):
         if self.test:
             with expected(self.test[0], "a log of the same joints"):
                 test = logs.in_order(self.read_logs(self.test, machine)[0], log.joints)
+                twins = inspection.repeated(test.recordings, log.recordings)
+                require(not twins, "--test", "recordings that LOGS has not", brief(twins))
         else:
             log, test = logs.split(log)
-        reports = inspection.inspect(log)
+        reports = inspection.inspect(log, known)
         for wrong in inspection.wrong_signs(reports):
             raise ValueError(f"{self.logs[0]}: {wrong}")
+        warnings = [*inspection.warnings(log, reports, known)]
+        print(*(f"warning: {one}\n" for one in warnings), sep="", end="", flush=True)
         name = known.name if known else ""
         net = fitting.fit_nets(log, settings, self.seed, machine, name)
         scores = validation.score(net, test)
-        warnings = [*validation.warnings(scores), *inspection.warnings(log, reports, known)]
+        of_scores = [*validation.warnings(scores)]
         save_net(self.out, net)
+        print(f"{self.out}: nets of {name or 'an unknown machine: one a joint, without a valve'}")
+        print_scores(scores, of_scores)
         if self.json:
             files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
             meta = {"machine": name, **files, **net.training}
-            write_json(self.json, {"meta": meta, "joints": scores, "warnings": warnings})
-        print(f"{self.out}: nets of {name or 'an unknown machine'}")
-        print_scores(scores, warnings)
+            told = {"joints": scores, "warnings": of_scores + warnings}
+            write_json(self.json, {"meta": meta} | told)
 
 
 def is_table(path: Path) -> bool:

@@ -32,7 +32,7 @@ class Simulate(Command):
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped every 5 ms.
+    plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped once a tick.
     fault: tuple[str, ...] = ()  # [JOINT:]KIND@SECONDS, as q3:stuck@5 ok@8; see docs/hardware.md.
 
     def __call__(self, machine: Machine) -> None:
@@ -61,9 +61,8 @@ class DriveMachine(Command):
     log: Path | None = None  # Also log every frame here, candump format.
 
     def __call__(self, machine: Machine) -> None:
-        self.writes(self.log)
-        if self.valves and not self.valves.exists():
-            self.writes(self.valves)
+        new = None if self.valves and self.valves.exists() else self.valves
+        self.writes(self.log, new, reads=[Path(self.command)])
         learns = self.adapt or self.shadow
         check(learns or not self.valves, "--valves", "--adapt or --shadow with it", self.valves)
         nets = self.controller != "jog" or not (self.adapt or self.valves)
@@ -208,5 +207,10 @@ class Export(Command):
         self.writes(self.out)
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # not on what is not needed here
         warnings.filterwarnings("ignore", category=FutureWarning, module="copyreg")  # torch's own
-        export_onnx(self.out, load_policy(self.policy, machine))
+        policy = load_policy(self.policy, machine)
+        export_onnx(self.out, policy)
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
+        if policy.interface != "paper":
+            print(
+                "examples/run_onnx.py has the observation of train --paper, not that of this policy"
+            )

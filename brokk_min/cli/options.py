@@ -3,14 +3,16 @@
 import os
 import runpy
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 
-from brokk_min._files import SHIPPED, brief, expected
+from brokk_min._files import NEW, SHIPPED, brief, expected
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.machine import BROKK_170, PWM_MAX, Machine, require
 
@@ -57,13 +59,24 @@ class Command:
         check(isinstance(machine, Machine), "--machine", "a Machine", brief(machine))
         return machine  # type: ignore[no-any-return]
 
-    def writes(self, *paths: Path | None) -> None:
-        """WrongUse: a file that cannot be written, or that exists without --force."""
-        for path in filter(None, paths):
-            folder = path.parent
+    def writes(self, *paths: Path | None, reads: Sequence[Path | None] = ()) -> None:
+        """WrongUse: a file that cannot be written, or exists without --force, or has another use.
+
+        What a command reads is in its options that are paths, and in `reads`. Files that are new
+        now must be so when they are written.
+        """
+        outputs = [path for path in paths if path]
+        options = (x if isinstance(x, tuple) else (x,) for x in vars(self).values())
+        inputs = [x for x in (*chain(*options), *reads) if isinstance(x, Path)]
+        inputs = [x.resolve() for x in inputs if not any(x is path for path in outputs)]
+        for i, path in enumerate(outputs):
+            folder, target = path.parent, path.resolve()
             fits = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
             check(fits, str(path), "a file in an existing, writable folder", "none")
+            once = target not in inputs + [one.resolve() for one in outputs[:i]]
+            check(once, str(path), "a name of its own", "that of another file of this command")
             check(self.force or not path.exists(), str(path), "no file (or --force)", "one")
+            (NEW.discard if self.force else NEW.add)(target)
 
 
 def load_object(option: str, name: str) -> Any:
@@ -71,13 +84,14 @@ def load_object(option: str, name: str) -> Any:
     path, _, symbol = name.rpartition(":")
     known = "analytic" if option == "--plant" else BROKK_170.name
     check(path.endswith(".py"), option, f"{known} or FILE.py:NAME", name)
-    folder = str(Path(path).resolve().parent)
+    folder, before = str(Path(path).resolve().parent), Path.cwd()
     sys.path.insert(0, folder)  # files beside it can be imported
     try:
         found = runpy.run_path(path)
     except (Exception, SystemExit) as error:  # whatever the file does
         raise ValueError(f"{option}: expected {path} to run, got {brief(error)}") from error
     finally:
+        os.chdir(before)  # paths are those of the shell, wherever the file goes
         sys.path.remove(folder)
         sys.path.append(folder)  # also later, but in place of no package
     check(symbol in found, option, f"an object {symbol} in {path}", "none")

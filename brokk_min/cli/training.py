@@ -58,9 +58,16 @@ class Train(Training):
         from brokk_min.learning.checkpoint import train_policy
 
         self.writes(self.out)
-        fits = self.resume or not Path(f"{self.out}.checkpoint").exists()
-        check(fits, f"{self.out}.checkpoint", "--resume or no checkpoint", "one")
-        train_policy(machine, load_net(self.actuator, machine), recipe, self.seed, self.out)
+        checkpoint = Path(f"{self.out}.checkpoint")
+        try:
+            checkpoint.touch(exist_ok=self.resume)  # the name is taken, for other trainings
+        except FileExistsError:
+            check(False, str(checkpoint), "--resume or no checkpoint", "one")
+        try:
+            train_policy(machine, load_net(self.actuator, machine), recipe, self.seed, self.out)
+        finally:
+            if checkpoint.exists() and not checkpoint.stat().st_size:  # nothing is learned yet
+                checkpoint.unlink()
         print(f"{self.out}: trained; curve in {self.out}.csv")
 
 

@@ -17,7 +17,7 @@ from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.identification.net_file import fingerprint, select_nets
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
-from brokk_min.machine import Array, Machine
+from brokk_min.machine import Array, Machine, require
 from brokk_min.settings import TaskConfig
 
 BY_HAND, RAW = "pid_by_hand", "pid_by_hand_raw"
@@ -215,5 +215,8 @@ def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> Baselines:
         gains = {}
         for name, row in file["gains"].items():
             kind = StrongGains if name == STRONGEST else Gains
-            gains[name] = kind(**{key: np.array(values, float) for key, values in row.items()})
+            arrays = {key: np.array(values, float) for key, values in row.items()}
+            finite = all(np.isfinite(array).all() for array in arrays.values())
+            require(finite, f"{path}: {name}", "finite numbers", "others")
+            gains[name] = kind(**arrays)
         return baselines(machine, net, gains)

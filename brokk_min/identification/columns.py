@@ -1,23 +1,24 @@
 """Tables of other people's loggers: which column is what, in which unit.
 
 A mapping says `boom=Boom_ang:deg,u_boom=Lever:percent,time=Zeit:ms`: column of a log = column of
-the file : unit. A unit may also be a number, by which the column is multiplied; a negative one
-changes its sign.
+the file : unit. A unit may also be a number, by which the column is multiplied. A minus changes the
+sign, as in `-deg` and `-1`.
 """
 
 import math
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brokk_min._files import brief, load_arrays, numbers, read_csv
-from brokk_min.identification.ros_logs import read_ros
+from brokk_min._files import brief, numbers, read_csv
+from brokk_min.identification.ros_logs import COMMAND_TIME, read_ros
 from brokk_min.machine import Array, require
 
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
-TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # beside folders of ROS
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
 LARGEST = 1e12  # of numbers in a log, assumed: any time, angle or velocity
@@ -33,7 +34,7 @@ def parse_map(text: str) -> Mapped:
         of_log = name if name in ("run", "time") or name[:2] in ("u_", "q_") else f"q_{name}"
         units = TIMES if name == "time" else UNITS
         try:
-            factor = units.get(unit) or float(unit)
+            factor = units.get(unit) or -units.get(unit.removeprefix("-"), 0) or float(unit)
         except ValueError:
             factor = 0.0
         fits = bool(name and column and factor) and of_log not in result
@@ -43,23 +44,31 @@ def parse_map(text: str) -> Mapped:
     return result
 
 
-def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> dict[str, Any]:
+def load_table(
+    path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS
+) -> tuple[dict[str, Any], list[str]]:
     """Columns `run`, `time` [s], `u_` and `q_` of each joint, under their names or mapped ones.
 
-    `topics` are those of a recording of ROS. A table without `run` is one recording, by the name
-    of its file. ValueError: no such file or column, or the row of what cannot be a value.
+    `topics` are those of a recording of ROS, whose commands have a column of time of their own; its
+    warnings come second. A table without `run` is one recording, by the name of its file.
+    ValueError: no such file or column, or the row of what cannot be a value; an angle may be nan.
     """
-    table: dict[str, Any]
     if path.suffix.lower() == ".csv":
-        table = dict(read_csv(path))
-    elif path.suffix.lower() == ".npz":
-        table = load_arrays(path)[1]
-    else:
-        table = read_ros(path, *topics)
+        return find_columns(path, read_csv(path), mapped), []
+    if path.suffix.lower() == ".npz":
+        with np.load(path, allow_pickle=False) as archive:  # only what is wanted is read
+            return find_columns(path, archive, mapped), []
+    table, warnings = read_ros(path, *topics)
+    return find_columns(path, table, mapped), warnings
+
+
+def find_columns(path: Path, table: Mapping[str, Any], mapped: Mapped) -> dict[str, Any]:
+    """The columns of `load_table` in a table of any others."""
     joints = dict.fromkeys(name[2:] for name in (*table, *mapped) if name.startswith("u_"))
     joints |= dict.fromkeys(name[2:] for name in mapped if name.startswith("q_"))
     require(len(joints) > 0, "columns", "u_<joint> (--map u_NAME=COLUMN:UNIT)", brief(list(table)))
-    names = ["time", *(f"{kind}_{joint}" for kind in "uq" for joint in joints)]
+    times = [name for name in ("time", COMMAND_TIME) if name in ("time", *table)]
+    names = [*times, *(f"{kind}_{joint}" for kind in "uq" for joint in joints)]
     sources = {name: (name, 1.0) for name in names} | mapped
     for name, (column, _) in sources.items():
         wanted = f"{column!r} (--map {name}=COLUMN:UNIT)"
@@ -68,8 +77,9 @@ def load_table(path: Path, mapped: Mapped, topics: tuple[str, str] = TOPICS) -> 
     for name in names:
         column, factor = sources[name]
         result[name] = _numbers(path, name, np.ravel(table[column]), factor)
-        rows, got = len(result["time"]), len(result[name])
-        require(got == rows, f"column {name}", f"{rows} numbers, as many as of time", got)
+        rows, got = len(result[times[-1] if name[:2] == "u_" else "time"]), len(result[name])
+        wanted = f"{rows} numbers, as many as of time"
+        require(name in times or got == rows, f"column {name}", wanted, got)
     column, _ = sources.get("run", ("run", 1.0))
     run = np.asarray(table.get(column, path.stem)).astype(str)
     return {"run": np.broadcast_to(run, len(result["time"]))} | result
@@ -91,7 +101,8 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
     result: Array = np.asarray(values * factor, float)
     command = name.startswith("u_")
     limit = 1.0 if command else LARGEST
-    for row in np.flatnonzero(~(np.abs(result) <= limit)):  # also where it is nan
+    unread = np.isnan(result) & name.startswith("q_")
+    for row in np.flatnonzero(~(np.abs(result) <= limit) & ~unread):  # also where it is nan
         unit = f" (per cent: --map {name}=COLUMN:percent)" if command else ""
         wanted = f"-{limit:g} to {limit:g}{unit}"
         raise ValueError(f"row {row + 2}, column {name}: expected {wanted}, got {result[row]}")

@@ -9,21 +9,22 @@ A grid gives delay, lag and dead zones, and least squares give the gains. Sample
 recorded range do not count, because a joint that is pushed against its stop stands still.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
 from scipy.signal import lfilter
 from tqdm import tqdm
 
 from brokk_min._files import brief
-from brokk_min.fit import COMMANDED, Log, Recording, Samples, join_recordings, moving
-from brokk_min.machine import Array, Machine
+from brokk_min.fit import COMMANDED, MOVED, Log, Recording, Samples, join_recordings, moving
+from brokk_min.machine import PWM_MAX, Array, Joint, Machine
 
 # What is searched, all assumed.
-LATEST = 0.4  # s, longest delay
+LATEST = 0.6  # s, longest delay
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s
 ZONES = 0.01 * np.arange(61)  # dead zones, of full command
 AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
@@ -31,12 +32,23 @@ PAUSE = 2.0  # s, after so long a joint without commands is at rest
 CLEAR_SIGN = 0.1  # least correlation that has a clear sign
 OPPOSITE = 0.4  # least correlation of a recording with the other sign
 FASTEST = 0.999  # quantile of the speeds, because the single ones have noise
+COARSE = 0.5  # s
+CLEAR = 0.2  # of the fastest expected motion: more is clear
+OPENS = 0.3  # of full command: it opens any valve
+RESTS = 0.1  # of the expected motion: less is rest
+STILL = 1.5  # s of clear commands without motion; in sound logs of ours up to 1.15
+RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
 LEAST_EXPLAINED = 0.6  # of a joint's motion by its commands; of sound logs of ours 0.84
 BEYOND = 0.05  # of a joint's range, outside of it
 FOLLOWS = 0.8  # of a joint's motion without commands, that another joint explains
+COARSER = 0.15  # more of the coarse motion is explained: angles have noise or steps
+ZONE = 0.04  # of full command, between the dead zones of machine and log
+WORSE = 1.25  # times as much is not explained with the machine's dead zones
+FASTER, SLOWER = 1.2, 0.4  # of the machine's fastest motion, which are in the log
+AT_LIMIT = 0.95  # of the command limit: such commands should give the fastest motion
 
 
 class JointReport(NamedTuple):
@@ -46,38 +58,87 @@ class JointReport(NamedTuple):
     low: float  # rad, smallest angle
     high: float  # rad
     fastest: tuple[float, float]  # rad/s, of the velocities in the log
-    opposite: list[str]  # recordings in which it moves against the model of all of them
-    follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
+    largest: tuple[float, float]  # commands, of full command
     sign: int  # of the velocity under a positive command; 0: not clear
     explained: float  # part of the velocities' power that the model explains
+    coarse: float  # the same of means over half a second, in which noise and steps do not count
     delay: float  # s
+    tau: float  # s
     dead_zone: tuple[float, float]  # of full command
+    step: float  # rad, by which its angle usually changes in a tick, if it does
+    by_zones: float  # part that it explains with the machine's dead zones; 1 if these are unknown
+    still: list[str]  # recordings in which commands do not move it; all else is without them
+    opposite: list[str]  # recordings in which it moves against the model of all of them
+    follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
+    other: str = ""  # the joint whose commands explain its motion
+    rest: float = 0.0  # the command at which it rests, if that is clearly not 0
+    one_size: bool = False  # are all commands in a direction of one size?
 
 
-def inspect(log: Log) -> dict[str, JointReport]:
-    """A report of each joint that is driven in a log."""
+def inspect(log: Log, machine: Machine | None = None) -> dict[str, JointReport]:
+    """A report of each joint that is driven in a log, perhaps of a machine that is known."""
     reports, samples = {}, join_recordings(log)
     for j, name in enumerate(tqdm(log.joints, desc="inspect", unit="joint", disable=None)):
         recordings = [one for one in log.recordings if moving(one)[j]]
+        zones = machine.joints[machine.names.index(name)].dead_zone if machine else None
         if recordings:
-            rows = samples.moves[:, j]
-            u, q, q_dot = (x[rows, j] for x in (samples.u, samples.q, samples.q_dot))
-            each = [(one.name, motion_of([one], j, log.rate)) for one in recordings]
-            model = fit_model(motion_of(recordings, j, log.rate))
-            ticks = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
-            reports[name] = JointReport(
-                minutes=ticks / log.rate / 60,
-                low=q.min(),
-                high=q.max(),
-                fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
-                opposite=[run for run, motion in each if contradicts(motion, model)],
-                follows=followed_joints(log, samples, j),
-                sign=sign(u, q_dot, log.rate),
-                explained=model.explained,
-                delay=model.lag[0] / log.rate,
-                dead_zone=(model.zones[0], model.zones[1]),
-            )
+            follows = followed_joints(log, samples, j)
+            reports[name] = inspect_joint(log, recordings, j, zones)._replace(follows=follows)
     return reports
+
+
+def inspect_joint(
+    log: Log, recordings: list[Recording], j: int, zones: tuple[float, float] | None
+) -> JointReport:
+    """The report of joint `j`, by recordings in which it has commands or moves.
+
+    `zones` are the dead zones of the machine. What the joint follows is not looked at.
+    """
+    rate = log.rate
+    u, q = (np.concatenate([x[:, j] for x in of]) for of in list(zip(*recordings))[1:3])
+    span = (q.min(), q.max())
+    each = [motion_of([one], j, rate, span) for one in recordings]
+    rows = [*range(len(recordings))]
+    sound = [i for i in rows if np.ptp(recordings[i].q[:, j]) > MOVED] or rows
+    for _ in range(4):  # again without those in which it stands still, until they are found
+        motion = motion_of([recordings[i] for i in sound], j, rate, span)
+        model = fit_model(motion)
+        moves = [i for i in rows if not stands_still(each[i], model, motion)]
+        if moves in ([], sound):
+            break
+        sound = moves
+    kept = [recordings[i] for i in sound]
+    q_dot = np.concatenate([one.q_dot[:, j] for one in kept])
+    steps = np.abs(np.diff(q))
+    by = {
+        name: fit_model(motion_of(kept, j, rate, span, i)).explained
+        for i, name in enumerate(log.joints)
+        if i != j and model.explained < LEAST_EXPLAINED
+    }
+    other = max(by, key=lambda name: by[name], default="")
+    driven = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
+    held = means(motion, motion.u, 1.0)
+    return JointReport(
+        minutes=driven / rate / 60,
+        low=span[0],
+        high=span[1],
+        fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
+        largest=(held.max(), -held.min()),
+        sign=sign(np.concatenate([one.u[:, j] for one in kept]), q_dot, rate),
+        explained=model.explained,
+        coarse=coarsely_explained(motion, model),
+        delay=model.lag[0] / rate,
+        tau=model.lag[1],
+        dead_zone=(model.zones[0], model.zones[1]),
+        step=float(np.median(steps[steps > 0])) if steps.any() else 0.0,
+        by_zones=best_lag(motion, np.array(zones)).explained if zones else 1.0,
+        still=[recordings[i].name for i in rows if i not in moves],
+        opposite=[recordings[i].name for i in rows if contradicts(each[i], model)],
+        follows={},
+        other=other if by.get(other, 0) > LEAST_EXPLAINED else "",
+        rest=rest_of(motion_of(list(log.recordings), j, rate, span)),
+        one_size=one_size(u),
+    )
 
 
 def sign(u: Array, q_dot: Array, rate: float) -> int:
@@ -113,14 +174,24 @@ class Motion(NamedTuple):
     rate: float  # Hz
 
 
-def motion_of(recordings: list[Recording], j: int, rate: float) -> Motion:
-    """Joint `j` of recordings that begin at rest."""
+def motion_of(
+    recordings: list[Recording],
+    j: int,
+    rate: float,
+    span: tuple[float, float],
+    commands: int | None = None,
+) -> Motion:
+    """Joint `j` of recordings that begin at rest, in its range `span` [rad].
+
+    Its commands may be those of another joint.
+    """
     rest = (0, round(PAUSE * rate))
-    u = np.concatenate([np.pad(one.u[:, j], rest) for one in recordings])
+    of = j if commands is None else commands
+    u = np.concatenate([np.pad(one.u[:, of], rest) for one in recordings])
     q = np.concatenate([np.pad(one.q[:, j], rest, "edge") for one in recordings])
     counts = np.concatenate([np.pad(np.ones(len(one.u), bool), rest) for one in recordings])
-    q_next, margin = np.append(q[1:], q[-1]), AT_STOP * np.ptp(q)
-    counts &= (q_next > q.min() + margin) & (q_next < q.max() - margin)
+    q_next, margin = np.append(q[1:], q[-1]), AT_STOP * (span[1] - span[0])
+    counts &= (q_next > span[0] + margin) & (q_next < span[1] - margin)
     return Motion(u, (q_next - q) * rate * counts, counts, rate)
 
 
@@ -135,16 +206,21 @@ class Model(NamedTuple):
 
 def fit_model(motion: Motion) -> Model:
     """A grid of delays and lags, then one of dead zones, twice."""
-    lags = list(product(range(round(LATEST * motion.rate) + 1), TAUS))
     zones = np.array([0.05, 0.05])
     for _ in range(2):
-        best = max((with_gains(motion, lag, zones) for lag in lags), key=lambda one: one.explained)
+        best = best_lag(motion, zones)
         for side in (0, 1):
             trials = [np.where(np.arange(2) == side, zone, zones) for zone in ZONES]
             models = (with_gains(motion, best.lag, trial) for trial in trials)
             best = max(models, key=lambda one: one.explained)
             zones = best.zones
     return best
+
+
+def best_lag(motion: Motion, zones: Array) -> Model:
+    """The delay and lag that explain a motion best with these dead zones (2,)."""
+    lags = product(range(round(LATEST * motion.rate) + 1), TAUS)
+    return max((with_gains(motion, lag, zones) for lag in lags), key=lambda one: one.explained)
 
 
 def with_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> Model:
@@ -166,9 +242,66 @@ def responses(motion: Motion, lag: tuple[int, float], zones: Array) -> Array:
     return np.asarray(lfilter([1 - a], [1, -a], openings))
 
 
+def expected_velocity(motion: Motion, model: Model) -> Array:
+    """What the model says of a motion [rad/s] (T,), 0 where samples do not count."""
+    return np.asarray(model.gains @ responses(motion, model.lag, model.zones) * motion.counts)
+
+
+def means(motion: Motion, values: ArrayLike, seconds: float) -> Array:
+    """Means over so many seconds, (T,)."""
+    window = np.ones(round(seconds * motion.rate))
+    return np.convolve(np.asarray(values, float), window / len(window))[: len(motion.u)]
+
+
+def coarsely_explained(motion: Motion, model: Model) -> float:
+    """What the model explains of the means over `COARSE` seconds."""
+    velocity = means(motion, motion.velocity, COARSE)
+    error = velocity - means(motion, expected_velocity(motion, model), COARSE)
+    power = float(velocity @ velocity)
+    return 1 - float(error @ error) / power if power else 0.0
+
+
+def reach(motion: Motion) -> Array:
+    """How far the joint has moved within the last second, (T,) [rad]; nan at ends of the range."""
+    second = round(motion.rate)
+    path = np.pad(np.cumsum(motion.velocity) / motion.rate, (second, 0))
+    widest = np.ptp(sliding_window_view(path, second + 1), axis=1)
+    return np.where(means(motion, motion.counts, 1.0) > 1 - 1e-9, widest, np.nan)
+
+
+def stands_still(motion: Motion, model: Model, others: Motion) -> bool:
+    """Does a joint rest while the model of `others` expects clear motion for `STILL` seconds?
+
+    Not in one piece, because a valve that was closed needs half of it to open.
+    """
+    if not others.velocity.any():
+        return bool(np.abs(motion.u).max() > OPENS)
+    expected = np.abs(expected_velocity(motion, model))
+    clear = max(CLEAR * np.abs(expected_velocity(others, model)).max(), MOVED)  # rad/s
+    ends = reach(motion) < RESTS * clear  # of a second at rest
+    rests = np.convolve(ends, np.ones(round(motion.rate)))[-len(ends) :] > 0
+    seconds = np.bincount(np.cumsum(~rests), rests & (expected > clear)) / motion.rate
+    return bool(seconds.max() > STILL)
+
+
+def rest_of(motion: Motion) -> float:
+    """The command while a joint rests, if it is clearly one, and not 0."""
+    calm = reach(motion) < RESTS * np.abs(motion.velocity).max()
+    if calm.sum() <= max(RESTING * motion.counts.sum(), LONG * motion.rate):
+        return 0.0
+    low, usual, high = np.quantile(motion.u[calm], (0.25, 0.5, 0.75))
+    return float(usual) if high - low < COMMANDED < abs(usual) else 0.0
+
+
+def one_size(u: Array) -> bool:
+    """Are the commands (T,) of a direction all as large as its largest, as those of a switch?"""
+    sides = [side[side > COMMANDED] for side in (u, -u)]
+    return all((side > 0.98 * side.max()).mean() > 0.9 for side in sides if len(side))
+
+
 def contradicts(motion: Motion, model: Model) -> bool:
     """Does a joint move against what the model expects of its commands?"""
-    expected = model.gains @ responses(motion, model.lag, model.zones)
+    expected = expected_velocity(motion, model)
     size = np.linalg.norm(expected) * np.linalg.norm(motion.velocity)
     return bool(expected @ motion.velocity < -OPPOSITE * size)
 
@@ -178,38 +311,117 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
     for name, report in reports.items():
         wanted = f"u_{name}: expected positive commands to raise q_{name}"
         if report.sign < 0:
-            yield f"{wanted}, got falling angles (--map {name}=COLUMN:-1)"
+            yield f"{wanted}, got falling angles (--map {name}=COLUMN:-1, or :-deg)"
         if report.opposite:
             yield f"{wanted} in all recordings or in none, got some in {brief(report.opposite)}"
+
+
+Check = tuple[Any, str]  # what must be true for the words to be told, and these words
+
+
+def causes(name: str, r: JointReport) -> Iterator[Check]:
+    """Why commands do not explain a motion; the first that holds is the one to look at."""
+    told = f"motion at so many times the speed of others {r.follows}"
+    doubt = "is it an angle to the ground? Then take differences of both angles"
+    yield r.follows, f"q_{name}: expected rest without commands, got {told}: {doubt}"
+    got = f"got motion by u_{r.other}: are columns mixed up?"
+    yield r.other, f"{name}: expected motion by u_{name}, {got}"
+    got = f"steps of {r.step:.3g} rad (of the encoder, or noise): {r.explained:.0%} of single"
+    wanted = f"q_{name}: expected angles finer than the motion in a tick"
+    noise = r.coarse > max(r.explained + COARSER, LEAST_EXPLAINED)
+    yield noise, f"{wanted}, got {got} ticks and {r.coarse:.0%} of {COARSE} s are explained"
+    wanted = f"{name}: expected {LEAST_EXPLAINED:.0%} of its motion by its commands"
+    yield r.explained < LEAST_EXPLAINED, f"{wanted}, got {r.explained:.0%}"
+    wanted = f"{name}: expected motion within {LATEST} s of its commands"
+    yield r.delay > LATEST - 1e-9, f"{wanted}, got it later: another clock?"
+
+
+def lacks(name: str, r: JointReport) -> Iterator[Check]:
+    """What nets could not learn from a log."""
+    got = f"recordings in which it rests (engine or pump off, or blocked?): {brief(r.still)}"
+    wanted = f"{name}: expected commands to move it"
+    yield (
+        r.still and not r.other,
+        f"{wanted}, got {got}; the figures are those of the others, if any",
+    )
+    yield r.rest, f"u_{name}: expected 0 at rest, got {r.rest:.3g}"
+    wanted = f"u_{name}: expected commands of many sizes, because nets cannot guess what is between"
+    yield r.one_size, f"{wanted}, got one in each direction"
+    few = round(r.minutes, 1) < LEAST_MINUTES
+    yield few, f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}"
+
+
+def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
+    """Where a log contradicts the machine that it should be of."""
+    joint = machine.joints[machine.names.index(name)]
+    width, got = joint.q_max - joint.q_min, f"got {r.low:.2f} to {r.high:.2f}"
+    low, high = np.deg2rad([r.low, r.high])
+    turned = min(beyond(low, high, joint), beyond(-high, -low, joint)) < BEYOND * width
+    doubt = f"in degrees (--map {name}=COLUMN:deg, or -deg)" if turned else "another zero or joint"
+    outside = beyond(r.low, r.high, joint) > BEYOND * width
+    yield outside, f"q_{name}: expected {joint.q_min:g} to {joint.q_max:g}, {got}: {doubt}?"
+    narrow = r.high - r.low < LEAST_RANGE * width
+    yield narrow, f"{name}: expected {LEAST_RANGE:.0%} of its range or more, {got}"
+    apart = np.abs(np.subtract(r.dead_zone, joint.dead_zone)).max() > ZONE
+    worse = 1 - r.by_zones > WORSE * (1 - r.explained)
+    wanted = f"{name}: expected the machine's dead_zone {joint.dead_zone}"
+    explained = r.explained > LEAST_EXPLAINED
+    yield (
+        explained and apart and worse,
+        f"{wanted}, got ({r.dead_zone[0]:.2f}, {r.dead_zone[1]:.2f})",
+    )
+    speeds = joint.q_dot_up, joint.q_dot_down
+    ratio = np.array(r.fastest) / speeds
+    slow = (ratio < SLOWER) & (np.array(r.largest) > AT_LIMIT * machine.pwm_limit / PWM_MAX)
+    wanted = (
+        f"{name}: expected the machine's q_dot_up and q_dot_down {speeds} as the fastest motion"
+    )
+    fastest = f"({r.fastest[0]:.3g}, {r.fastest[1]:.3g})"
+    yield explained and (slow | (ratio > FASTER)).any(), f"{wanted}, got {fastest} rad/s"
+    memory = machine.history * machine.dt
+    wanted = f"history: expected more than delay and lag of {name}, {r.delay:.2f} and {r.tau:.2f} s"
+    yield explained and r.delay + r.tau > memory, f"{wanted}, got {memory:.2f} s"
+
+
+def beyond(low: float, high: float, joint: Joint) -> float:
+    """How far a range goes beyond that of the joint [rad]."""
+    return max(joint.q_min - low, high - joint.q_max)
 
 
 def warnings(
     log: Log, reports: Mapping[str, JointReport], machine: Machine | None
 ) -> Iterator[str]:
-    """What a log lacks, and where it contradicts the range of the machine that it should be of."""
+    """What a log lacks, and where it contradicts the machine that it should be of."""
     yield from log.warnings
+    if twins := repeated(log.recordings, ()):
+        yield f"recordings: expected each once, got again {brief(twins)}"
     yield from wrong_signs(reports)
     for name in log.joints:
         if name not in reports:
             yield f"{name}: expected commands in the log, got none"
-    joints = {joint.name: joint for joint in machine.joints} if machine else {}
     for name, r in reports.items():
-        if r.minutes < LEAST_MINUTES:
-            yield f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}"
-        if r.follows:
-            slopes = ", ".join(f"{slope:+.2f} times with {one}" for one, slope in r.follows.items())
-            doubt = "is it an angle to the ground? Then take differences of both angles"
-            yield f"q_{name}: expected rest without commands, got motion {slopes}: {doubt}"
-        elif r.explained < LEAST_EXPLAINED or r.delay > LATEST - 0.51 / log.rate:
-            got = f"{r.explained:.0%}, {r.delay:.2f} s later: of another joint, or another clock?"
-            yield f"{name}: expected {LEAST_EXPLAINED:.0%} of its motion by its commands, got {got}"
-        if joint := joints.get(name):
-            low, high, got = joint.q_min, joint.q_max, f"{r.low:.2f} to {r.high:.2f}"
-            if max(low - r.low, r.high - high) > BEYOND * (high - low):
-                doubt = f"another unit (--map {name}=COLUMN:deg), zero or joint?"
-                yield f"q_{name}: expected {low:g} to {high:g}, got {got}: {doubt}"
-            elif r.high - r.low < LEAST_RANGE * (high - low):
-                yield f"{name}: expected {LEAST_RANGE:.0%} of its range or more, got {got}"
+        yield from [text for holds, text in causes(name, r) if holds][:1]
+        known = differences(name, r, machine) if machine else ()
+        yield from (text for holds, text in (*lacks(name, r), *known) if holds)
+
+
+def repeated(recordings: Sequence[Recording], others: Sequence[Recording]) -> list[str]:
+    """Names of recordings with the same numbers as one before them, or as one of others.
+
+    A table may have rounded them. What does not move is no recording that counts.
+    """
+    every, twins = [*others, *recordings], []
+    sums = np.array([(len(one.u), one.u.sum(), one.q.sum()) for one in every])
+    for i, one in enumerate(recordings, len(others)):
+        near = np.flatnonzero((np.abs(sums[:i] - sums[i]) < 1e-5 * one.u.size).all(axis=1))
+        same = (all(map(close, every[k][1:3], one[1:3])) for k in near if sums[k, 0] == sums[i, 0])
+        twins += [one.name] if any(same) and moving(one).any() else []
+    return twins
+
+
+def close(a: Array, b: Array) -> bool:
+    """Do two arrays of one shape have the same numbers, but for rounding?"""
+    return bool((np.abs(a - b) < 1e-5).all())
 
 
 def table(reports: Mapping[str, JointReport]) -> Iterator[str]:

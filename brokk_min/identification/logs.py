@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from brokk_min._files import brief, expected, whole_file, write_csv
-from brokk_min.fit import Log, Recording, Rows, join_recordings, moving, velocity_of
+from brokk_min.fit import Log, Recording, join_recordings, moving, velocity_of
 from brokk_min.identification.columns import TOPICS, Mapped, load_table
 from brokk_min.identification.readings import check_run, left_out, pieces_of
+from brokk_min.identification.ros_logs import COMMAND_TIME
 from brokk_min.machine import Array, Machine, require
 
 MEAN_OF = 10  # samples of the held command in a tick, of which the mean is taken
@@ -85,7 +86,7 @@ def read_log(
     ValueError: the file, and the row (1 is the header), the column or the run of the first error.
     """
     with expected(path, "a log"):
-        table = load_table(path, mapped or {}, topics)
+        table, told = load_table(path, mapped or {}, topics)
         joints = tuple(name[2:] for name in table if name.startswith("u_"))
         u, q = (np.array([table[f"{kind}_{name}"] for name in joints]).T for kind in "uq")
         speeds = dict(zip(machine.names, machine.q_dot_max, strict=True))
@@ -96,25 +97,27 @@ def read_log(
         for i in np.argsort(first):
             run, rows = str(unique[i]), np.flatnonzero(number == i)
             time, angles = table["time"][rows], q[rows]
+            held = (time, u[rows]) if COMMAND_TIME not in table else (table[COMMAND_TIME], u)
             if len(rows) > 1:
-                check_run(run, time, angles, machine.rate, joints)
+                check_run(run, time, angles, machine.rate, joints, fastest)
             pieces, wrong[rows] = pieces_of(time, angles, machine.rate, fastest)
             for part, piece in enumerate(pieces):
                 skipped = machine.velocity_samples - 1 if part else 0
-                sampled = [x[skipped:] for x in _resample(time, u[rows], angles, piece, machine)]
+                resampled = _resample(*held, time[piece], angles[piece], machine)
+                sampled = [x[skipped:] for x in resampled]
                 if len(sampled[0]):
                     recordings.append(Recording(f"{run}#{part + 1}" if part else run, *sampled))
-        warnings = tuple(f"{path}: {one}" for one in left_out(wrong, q, joints))
+        warnings = tuple(f"{path}: {one}" for one in (*told, *left_out(wrong, q, joints)))
         return Log(joints, tuple(recordings), machine.rate, warnings)
 
 
 def _resample(
-    time: Array, u: Array, q: Array, rows: Rows, machine: Machine
+    u_time: Array, u: Array, t: Array, q: Array, machine: Machine
 ) -> tuple[Array, Array, Array]:
-    """u held, q of `rows` interpolated at the machine's rate, and q_dot estimated."""
-    t, rate = time[rows], machine.rate
+    """u held, q interpolated, each by its own times, at the machine's rate; and q_dot estimated."""
+    rate = machine.rate
     grid = t[0] + np.arange(int((t[-1] - t[0]) * rate + 1e-6) + 1) / rate
     parts = np.linspace(0, 1 / rate, MEAN_OF, endpoint=False)[:, None]
-    held = np.searchsorted(time, grid + parts + 1e-6, side="right") - 1
-    q = np.stack([np.interp(grid, t, angles) for angles in q[rows].T], axis=-1)
+    held = np.searchsorted(u_time, grid + parts + 1e-6, side="right") - 1
+    q = np.stack([np.interp(grid, t, angles) for angles in q.T], axis=-1)
     return u[held].mean(axis=0), q, velocity_of(q, machine.velocity_samples, rate)

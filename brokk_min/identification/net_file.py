@@ -36,6 +36,10 @@ def net_from_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, 
     """Nets from `net_arrays`; ValueError, with `path`, for what is no net."""
     with expected(path, "a complete actuator net"):
         kind = CLASSES[header["reads"]]
+        for name, array in arrays.items():
+            joints = len(header["joints"])
+            rows = array.shape[:1]
+            require(rows == (joints,), name, f"a row for each of {joints} joints", array.shape)
         found = {**header, **arrays, "joints": tuple(header["joints"])}
         found["weights"] = tuple(arrays[f"weight_{i}"] for i in range(6))
         net = kind(**{field.name: found[field.name] for field in fields(kind)})

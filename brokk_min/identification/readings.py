@@ -19,6 +19,7 @@ NOISE = 0.01  # rad or m, assumed: such steps are no motion
 FASTER = 2.0  # times the fastest motion, as in the safety gate: no joint does it
 USUAL = 4.0  # times the 90 % quantile of noise in steps, assumed: none is beyond it
 LASTS = 5  # rows, assumed: motion that lasts for three of them is real
+TOO_FAST = 10.0  # times the fastest motion of a machine, of one that is unknown 1 rad/s (assumed)
 LEAST = 10  # fast steps, assumed, that tell how often a sensor is read
 
 
@@ -67,8 +68,13 @@ def unread(time: Array, q: Array, fastest: float) -> NDArray[np.bool_]:
     return np.asarray(np.bincount(between)[between] < shortest)
 
 
-def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str]) -> None:
-    """ValueError: `time` does not rise, or new angles come more slowly than at `rate` [Hz]."""
+def check_run(
+    run: str, time: Array, q: Array, rate: float, joints: Sequence[str], fastest: Array
+) -> None:
+    """ValueError: `time` does not rise, or is in a unit in which joints move at `TOO_FAST`.
+
+    Or new angles come more slowly than at `rate` [Hz].
+    """
     step = np.diff(time)
     got = f"a step of {step.min():.6g} at {time[step.argmin()]:.6g}"
     require(step.min() > 0, f"run {run}, column time", "stamps that rise", got)
@@ -79,6 +85,15 @@ def check_run(run: str, time: Array, q: Array, rate: float, joints: Sequence[str
     sensors = f"q of {brief(slow)}, one every {rows.max():g} rows"
     where = sensors if rows.max() > 1 else "column time"
     require(not slow, f"run {run}, {where}", wanted, f"{1 / period.max():.3g} Hz")
+    lag = len(q) // 20  # over so many rows neither noise nor single jumps count
+    if lag > 1:
+        speeds = np.nan_to_num(np.abs(q[lag:] - q[:-lag])) / (time[lag:] - time[:-lag])[:, None]
+        usual, limit = np.quantile(speeds, 0.9, axis=0), TOO_FAST * np.where(fastest, fastest, 1.0)
+        for name, speed, most in zip(joints, usual, limit, strict=True):
+            got = f"{speed:.3g} in {time[-1] - time[0]:.3g} s altogether"
+            doubt = f"another unit (--map time=COLUMN:UNIT, or {name}=COLUMN:deg)?"
+            wanted = f"speeds of q_{name} up to {most:.3g} rad/s"
+            require(speed <= most, f"run {run}, column time", wanted, f"{got}: {doubt}")
 
 
 def pieces_of(
@@ -90,7 +105,10 @@ def pieces_of(
     that is longer than `MAX_GAP` and 2.5 samples.
     """
     each = list(zip(q.T, fastest, strict=True))
-    bad = np.stack([unread(time, angle, speed) for angle, speed in each], axis=1)
+    bad = np.isnan(q)
+    for j, (angle, speed) in enumerate(each):
+        known = np.flatnonzero(~bad[:, j])
+        bad[known, j] = unread(time[known], angle[known], speed)
     good = np.flatnonzero(~bad.any(axis=1))
     gap = np.diff(time[good]) > max(MAX_GAP, 2.5 / rate)
     cuts = np.zeros_like(bad)

@@ -1,51 +1,114 @@
 """Recordings of ROS (rosbag2 folders, `.mcap`, `.db3`, and `.bag` of ROS 1) as tables.
 
 Angles are in `sensor_msgs/JointState`, commands in another JointState (its first filled field) or
-in a `std_msgs/Float64MultiArray` in the order of the angles. A row is a message with angles and has
-the commands that hold then. All times are the recorder's, so both topics have one clock.
+in a `std_msgs/Float64MultiArray` in the order of the angles. Several nodes may send each. A command
+holds from its own stamp on. Stamps are those of the headers, moved to the recorder's clock by the
+message that was least late, or else the recorder's, which have the delays of the network in them.
 """
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from brokk_min._files import expected, require_package
-from brokk_min.machine import require
+from brokk_min.machine import Array, require
+
+STATE = "sensor_msgs/msg/JointState"
+ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
+COMMAND_TIME = "time of commands"  # the column with their stamps
+LATE = 0.01  # s, assumed: differences between the delays of messages that are worth a word
+OLD = 0.5  # s, and five usual periods, assumed: no machine waits so long for a command
+Values = list[tuple[float, dict[str, float]]]  # of joints by their names, each with its stamp [s]
 
 
-def read_ros(path: Path, angles: str, commands: str) -> dict[str, Any]:
-    """Columns `time,u_<joint>...,q_<joint>...` of the messages on two topics, in ROS's units.
+def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], list[str]]:
+    """Columns `time,q_<joint>...` and `time of commands,u_<joint>...` of two topics; and warnings.
 
-    ValueError: no rosbags, no recording, no such topic, or a number of commands that does not fit.
+    Both in ROS's units. ValueError: no rosbags, no recording, no such topic or another type of
+    message, or commands that do not fit the angles.
     """
     reader_of = require_package("rosbags.highlevel", "ros").AnyReader
     types = require_package("rosbags.typesys", "ros")
     store = types.get_typestore(types.Stores.ROS2_HUMBLE)  # of bags without definitions
-    rows: list[dict[str, float]] = []
-    order: list[str] = []
-    q: dict[str, float] = {}
-    u: dict[str, float] = {}
+    found: dict[str, list[tuple[float, Any]]] = {angles: [], commands: []}
     with expected(path, "a recording of ROS"), reader_of([path], default_typestore=store) as bag:
         for topic in (angles, commands):
             require(topic in bag.topics, f"{path}: --topics", f"two of {[*bag.topics]}", topic)
-        chosen = [one for one in bag.connections if one.topic in (angles, commands)]
-        for connection, stamp, data in bag.messages(chosen):
-            message = bag.deserialize(data, connection.msgtype)
-            if connection.topic == angles:
-                order = order or list(message.name)
-                q |= dict(zip(message.name, message.position, strict=True))
-                if u and u.keys() <= q.keys():
-                    row = {"time": stamp / 1e9} | {f"u_{name}": x for name, x in u.items()}
-                    rows.append(row | {f"q_{name}": q[name] for name in u})
-            elif order:
-                u = commands_of(message, order)
-    require(len(rows) > 0, str(path), f"{angles} after {commands}, of the same joints", "none")
-    return {column: [row[column] for row in rows] for column in rows[0]}
+        chosen = [one for one in bag.connections if one.topic in found]
+        for one in chosen:
+            kinds = (STATE,) if one.topic == angles else (STATE, *ARRAYS)
+            require(one.msgtype in kinds, f"{path}: {one.topic}", " or ".join(kinds), one.msgtype)
+        for one, stamp, data in bag.messages(chosen):
+            found[one.topic].append((stamp / 1e9, bag.deserialize(data, one.msgtype)))
+        (times, q_warnings), (u_times, u_warnings) = (clock(*item) for item in found.items())
+        states, orders = [message for _, message in found[angles]], [m for _, m in found[commands]]
+        names = [*dict.fromkeys(name for state in states for name in state.name)]
+        q = [(t, joints_of(state, names)) for t, state in zip(times, states, strict=True)]
+        u = [(t, joints_of(order, names)) for t, order in zip(u_times, orders, strict=True)]
+        table = columns_of(q, u)
+    several = states and len(names) > len(states[0].name) and hasattr(orders[0], "data")
+    order = [f"{commands}: expected one order of the joints, took {names}"] if several else []
+    return table, [*q_warnings, *u_warnings, *order, *old_commands(commands, table)]
 
 
-def commands_of(message: Any, order: list[str]) -> dict[str, float]:
-    """Commands by joint; ValueError: other numbers of them than of joints."""
+def clock(topic: str, messages: list[tuple[float, Any]]) -> tuple[Array, list[str]]:
+    """The time of each message [s], and a warning if the recorder's would have been another."""
+    recorded = np.array([time for time, _ in messages])
+    heads = [getattr(message, "header", None) for _, message in messages]
+    stamps = np.array([h.stamp.sec + h.stamp.nanosec / 1e9 if h else 0.0 for h in heads])
+    if not stamps.all() or (np.diff(stamps) < 0).any():
+        return recorded, []
+    late = recorded - stamps
+    least, usual = np.quantile(late, (0, 0.9))
+    got = f"some that are {usual - least:.3f} s later than others (the headers' are taken)"
+    told = f"{topic}: expected stamps of the recorder as regular as the headers', got {got}"
+    return stamps + least, [told] if usual - least > LATE else []
+
+
+def joints_of(message: Any, names: list[str]) -> dict[str, float]:
+    """Angles or commands by joint; ValueError: other numbers of them than of joints."""
     if hasattr(message, "data"):
-        require(len(message.data) == len(order), "commands", f"one of each {order}", message.data)
-        return dict(zip(order, message.data, strict=True))
+        require(len(message.data) == len(names), "commands", f"one of each {names}", message.data)
+        return dict(zip(names, message.data, strict=True))
     filled = (x for x in (message.position, message.velocity, message.effort) if len(x))
     return dict(zip(message.name, next(filled, []), strict=True))
+
+
+def columns_of(q: Values, u: Values) -> dict[str, Any]:
+    """The columns of `read_ros`: angles from the first complete command on, and all commands.
+
+    A row has the stamp of the joint with the fewest angles; those of other nodes are interpolated.
+    """
+    joints = [*dict.fromkeys(name for _, row in u for name in row)]
+    angles, commands = ({name: series(rows, name) for name in joints} for rows in (q, u))
+    known = [name for name, (times, _) in angles.items() if len(times)]
+    require(bool(joints) and known == joints, "angles", f"those of {joints} (--topics)", known)
+    start = max(times[0] for times, _ in commands.values())
+    time = min((times for times, _ in angles.values()), key=len)
+    u_time = np.array([t for t, _ in u])
+    time, u_time = time[time >= start], u_time[u_time >= start]
+    require(len(time) > 0, "angles", "some after the first command", "none")
+    table: dict[str, Any] = {"time": time, COMMAND_TIME: u_time}
+    for name in joints:
+        times, values = commands[name]
+        table[f"u_{name}"] = values[np.searchsorted(times, u_time, side="right") - 1]
+        table[f"q_{name}"] = np.interp(time, *angles[name])
+    return table
+
+
+def series(rows: Values, name: str) -> tuple[Array, Array]:
+    """Stamps and values of one joint."""
+    own = [(time, row[name]) for time, row in rows if name in row]
+    times, values = np.reshape(own, (-1, 2)).T
+    return times, values
+
+
+def old_commands(topic: str, table: dict[str, Any]) -> list[str]:
+    """A warning if a command holds for so long that a machine may have closed its valves."""
+    ages = np.diff(table[COMMAND_TIME], append=table["time"][-1])
+    usual, longest = np.median(ages), ages.max()
+    doubt = "does the machine close its valves then? Record zeros at rest"
+    got = f"none for {longest:.2g} s, while the last one holds here: {doubt}"
+    told = f"{topic}: expected a command every {usual:.2g} s, got {got}"
+    return [told] if longest > max(OLD, 5 * usual) else []

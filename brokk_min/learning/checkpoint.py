@@ -45,7 +45,7 @@ def train_policy(
     config, checkpoint = recipe.learner, Path(f"{out}.checkpoint")
     env, advantages, start = prepare(machine, net, recipe, seed)
     rows: Curve = []
-    if checkpoint.exists():
+    if checkpoint.exists() and checkpoint.stat().st_size:
         start, rows = load(checkpoint, about, env, start)
 
     def on_update(now: Checkpoint, rollout: Rollout, metrics: dict[str, float]) -> None:

@@ -7,6 +7,7 @@ folder that the calls write to, and one thread each, because torch's settings ho
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import dask
@@ -22,6 +23,7 @@ SETTINGS = {
     "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
 }
 LOCAL = {"threads_per_worker": 1, "memory_limit": None, "silence_logs": "CRITICAL"}
+PATIENCE = 30  # s until a worker is there
 LOCAL |= {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}  # no other computer reaches it
 
 
@@ -34,14 +36,17 @@ def side_by_side(
 
     A call receives the results of those that it `needs`, which stand before it. The others begin
     in their order, so the longest should stand first. The first exception is raised. OSError: no
-    scheduler answers. ValueError: it has workers of several threads.
+    scheduler answers. ValueError: it has no worker, or workers of several threads.
     """
     from distributed import Client, as_completed  # slow to import
 
     local = LOCAL | {"n_workers": min(cpu_count(), len(calls))}
     options: dict[str, Any] = {"address": scheduler, "timeout": 10} if scheduler else local
     with dask.config.set(SETTINGS), Client(**options) as client:  # type: ignore[no-untyped-call]
+        with suppress(TimeoutError):
+            client.wait_for_workers(1, timeout=PATIENCE)
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        require(len(workers) > 0, str(scheduler), f"a worker within {PATIENCE} s", "none")
         threads = sorted({worker["nthreads"] for worker in workers} - {1})
         require(not threads, str(scheduler), "workers with --nthreads 1", threads)
         if scheduler is None:

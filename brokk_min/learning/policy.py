@@ -94,6 +94,15 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         mean, scale = INTERFACES[header["interface"]].scale(machine)
         fits = np.array_equal(arrays["mean"], mean) and np.array_equal(arrays["scale"], scale)
         require(fits, str(path), f"the machine's scale of {header['interface']}", "another")
+        own = {"mean", "scale", *(f"layer_{i}" for i in range(8))}
         weights = tuple(arrays[f"layer_{i}"] for i in range(8))
-        net = select_nets(machine, net_from_arrays(path, header["net"], arrays))
+        size = len(mean)
+        for i in range(0, 8, 2):
+            outputs = len(machine.driven) if i == 6 else weights[i + 1].size
+            for k, shape in ((i, (size, outputs)), (i + 1, (outputs,))):
+                got = weights[k].shape
+                require(got == shape, f"layer_{k}", f"an array {shape}", got)
+            size = outputs
+        of_net = {name: array for name, array in arrays.items() if name not in own}
+        net = select_nets(machine, net_from_arrays(path, header["net"], of_net))
         return Policy(machine, header["training"], weights, net, header["interface"])

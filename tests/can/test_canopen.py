@@ -116,7 +116,7 @@ def test_set_up_nodes__refuses_an_encoder_that_does_not_fit(upward, refusal):
     [
         (brokk(SLEW, *OTHERS, SIXTH), "joints: expected at most 5 on a bus, got 6"),
         (replace(BROKK_170, valve_frame_id=0x583), "valve_frame_id: .* no other frame, got 0x583"),
-        (SLOW, r"rate: expected 10 Hz or more \(watchdog\), got 5"),
+        (SLOW, r"rate: expected 12 Hz or more \(watchdog\), got 5"),
         (
             brokk(SLIDE),
             "q1: expected revolute, with a range below 6.18 rad, on a bus, got prismatic",
@@ -129,7 +129,7 @@ def test_machines_that_do_not_fit_the_bus__are_refused_on_both_its_sides(machine
         SimulatedMachine(machine, np.zeros(machine.n), 0.0)
     with pytest.raises(ValueError, match=refusal):
         set_up_nodes(None, machine)
-    SimulatedMachine(replace(SLOW, rate=10.0), START, 0.0)
+    SimulatedMachine(replace(SLOW, rate=12.5), START, 0.0)
 
 
 def test_nodes__take_in_frames_by_hand():

@@ -38,7 +38,10 @@ def test_read_frames__reads_what_candump_logs_and_what_it_prints_on_a_terminal(t
     fd = " (2.000000)  can0  123  [12]  " + "00 " * 12 + "\n"
     printed = f" (1.000000)  can0  123   [2]  01 02\n{fd} (3.000000)  can0  080   [0]  \n"
     (tmp_path / "terminal.txt").write_text(printed)
-    for name, sent in (("can.log", True), ("terminal.txt", False)):
+    letters = printed.replace("02\n", "02                     '..'\n").replace("[0]", "[00]")
+    flags = letters.replace("can0  ", "can0  RX - -  ").replace("[2]", "[02]")
+    (tmp_path / "axes8.txt").write_text(flags)
+    for name, sent in (("can.log", True), ("terminal.txt", False), ("axes8.txt", False)):
         expected = [Frame(1.0, 0x123, b"\x01\x02"), Frame(3.0, 0x80, b"", sent)]
         assert list(read_frames(tmp_path / name)) == expected
 
@@ -60,6 +63,13 @@ def test_read_frames__reads_the_logs_of_other_tools(tmp_path, name):
 def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
     (tmp_path / "log.csv").write_text("(1.0) can0 123#0102\nrun,time,u_a,q_a\n")
     with pytest.raises(ValueError, match=r"log.csv: row 2: expected .time. bus"):
+        list(read_frames(tmp_path / "log.csv"))
+    (tmp_path / "log.csv").write_text("(1.0) can0 12345678#01\n(2.0) can0 RTR 123\n")
+    with pytest.raises(ValueError, match=r"expected data frames of 11 bits, got row 1: .*345678#"):
+        list(read_frames(tmp_path / "log.csv"))
+    two = "(1.0) can0 123#01\n(2.0) operator 7FF#01\n(3.0) can1 123#02\n"
+    (tmp_path / "log.csv").write_text(two)
+    with pytest.raises(ValueError, match=r"frames of one bus .*, got can0 and can1"):
         list(read_frames(tmp_path / "log.csv"))
     (tmp_path / "log.csv").write_bytes(bytes(range(256)))
     with pytest.raises(ValueError, match=r"log\.csv: expected a candump log, got"):

@@ -16,8 +16,8 @@ CONTROLLER = 16
 class Machine(SimulatedMachine):
     """It begins at 100 s."""
 
-    def __init__(self):
-        super().__init__(BROKK_170, START, 100.0, Recorder())
+    def __init__(self, *period):
+        super().__init__(BROKK_170, START, 100.0, Recorder(), *period)
 
     def take(self, can_id, data=b"", now=100.0):
         return self.receive(Frame(now, can_id, data))
@@ -51,6 +51,20 @@ def test_advance__moves_and_beats_by_its_own_clock():
     assert beats == 2 * [first[0], (0x702, bytes([5])), *first[2:]]
     assert machine.steps == len(machine.plant.u) == 30 and not np.any(machine.plant.u)
     np.testing.assert_allclose(machine.plant.q, [START] * 30)
+
+
+def test_advance__moves_a_plant_of_ones_own_once_a_tick_by_the_command_that_held():
+    """With each SYNC, which may be 2 ms early or late; without, by its own clock."""
+    machine = Machine(0.05)
+    assert machine.stepped.dt == 0.05
+    machine.take(0x000, b"\1\0")
+    for k, late in enumerate((0.0, -0.002, 0.002, 0.0, 0.002)):
+        now = 100.02 + 0.05 * k + late
+        machine.advance(now)
+        machine.valves(k, 10 * k, now=now)
+    assert np.rint(127 * np.array(machine.plant.u))[:, 0].tolist() == [0, 10, 20, 30]
+    machine.advance(100.4)
+    assert len(machine.plant.u) == 4 + 3
 
 
 def test_receive__opens_valves_after_a_start_and_a_neutral_frame():

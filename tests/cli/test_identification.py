@@ -132,4 +132,4 @@ def test_inspect__reads_recordings_of_ros(tmp_path, capsys):
 
     bag = record(tmp_path / "bag", drive(lambda k: multi_array([k / 20, 0.0, -k / 40])))
     assert run("inspect --topics /joint_states /valves --map arm=q_arm:-1", bag) == 0
-    assert 'Joint("arm", q_min=0.040, q_max=0.380' in capsys.readouterr().out
+    assert re.search(r'Joint\("arm", q_min=-?0.000, q_max=0.380', capsys.readouterr().out)

@@ -78,6 +78,19 @@ def test_commands__need_no_torch_or_say_how_to_install_it(tmp_path):
     assert [path.name for path in tmp_path.iterdir() if path.suffix != ".csv"] == ["log.npz"]
 
 
+@pytest.mark.parametrize("line", ["--help", "fit --help", "--version"])
+def test_main__is_silent_if_nobody_reads(line):
+    """As under `| true`, and ends on the narrowest terminal."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "brokk_min", *line.split()]
+    environment = os.environ | {"COLUMNS": "1", "PYTHONPATH": str(ROOT)}
+    pipes = {"stdout": writer, "stderr": subprocess.PIPE}
+    done = subprocess.run(command, env=environment, timeout=60, **pipes)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, b"")
+
+
 GERMAN = """
 from dataclasses import replace
 from brokk_min.machine import BROKK_170

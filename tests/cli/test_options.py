@@ -1,6 +1,7 @@
 """Machines and plants of files, and policies of the package."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,6 +53,33 @@ def test_find_machine__takes_a_name_or_an_object_of_a_file(file):
     file.write_text("raise SystemExit(0)")
     with pytest.raises(ValueError, match=r"--machine: expected .* to run, got SystemExit"):
         Command(machine=f"{file}:DIGGER").find_machine()
+
+
+def test_find_machine__stays_in_its_folder(file, monkeypatch):
+    monkeypatch.chdir(file.parent)
+    (file.parent / "deeper").mkdir()
+    file.write_text(FILE + "\nimport os; os.chdir('deeper')")
+    assert Command(machine="own.py:DIGGER").find_machine().name == "digger"
+    assert Path.cwd() == file.parent
+
+
+@dataclass(kw_only=True)
+class Reads(Command):
+    """It reads two files, and more."""
+
+    logs: tuple[Path, ...] = (Path("a"), Path("b"))
+    out: Path = Path("c")
+    json: Path | None = None
+
+
+def test_writes__refuses_a_name_for_two_files_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to(tmp_path / "b")
+    for out, more in (("c", "c"), ("b", None), (f"{tmp_path}/a", None), ("link", None), ("d", "c")):
+        command = Reads(out=Path(out), json=more and Path(more), force=True)
+        with pytest.raises(WrongUse, match="expected a name of its own, got that of another file"):
+            command.writes(command.out, command.json, reads=[Path("d")])
+    command.writes(Path("e"), command.json)
 
 
 def test_find_plant__tries_each_joint(file):

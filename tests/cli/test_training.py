@@ -10,6 +10,7 @@ from helpers_cli import run
 from helpers_machines import small_net
 
 from brokk_min.identification.net_file import save_net
+from brokk_min.learning import checkpoint
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
 from brokk_min.settings import PPOConfig
@@ -44,6 +45,23 @@ def test_train__goes_on_only_if_it_is_told_to(tmp_path, capsys):
     assert "checkpoint: expected --resume or no checkpoint, got one" in capsys.readouterr().err
     assert run(f"{line} --resume") == 1
     assert "missing.npz: no such file" in capsys.readouterr().err
+
+
+def test_train__has_its_name_for_itself_while_it_runs(tmp_path, monkeypatch, capsys):
+    """A second training of the name is refused, and may begin once the first one has ended."""
+    save_net(tmp_path / "net.npz", small_net(BROKK_170, np.random.default_rng(0)))
+    line = f"train --actuator {tmp_path}/net.npz --out {tmp_path}/p.npz {SMALL}"
+    prepare, status = checkpoint.prepare, []
+
+    def meanwhile(*arguments):
+        monkeypatch.undo()
+        status.append(run(f"{line} --seed 2"))
+        return prepare(*arguments)
+
+    monkeypatch.setattr(checkpoint, "prepare", meanwhile)
+    assert (run(line), status) == (0, [2])
+    assert "p.npz.checkpoint: expected --resume or no checkpoint" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"net.npz", "p.npz", "p.npz.csv"}
 
 
 def test_porting_page__names_all_settings_and_no_others():

@@ -27,7 +27,7 @@ def theirs(tmp_path, *stamps):
 )
 def test_load_table__takes_names_units_and_stamps_from_a_mapping(tmp_path, stamps, unit):
     mapped = parse_map(f"boom=Boom [deg]:deg, u_boom=Lever:percent,run=Drive,time=Zeit{unit}")
-    table = load_table(theirs(tmp_path, *stamps), mapped)
+    table, _ = load_table(theirs(tmp_path, *stamps), mapped)
     assert table["run"].tolist() == ["7"] * 3
     np.testing.assert_allclose(table["time"] - table["time"][0], [0, 0.05, 0.1], atol=1e-9)
     np.testing.assert_allclose(table["q_boom"], np.deg2rad([10, 11, 12]))
@@ -35,9 +35,9 @@ def test_load_table__takes_names_units_and_stamps_from_a_mapping(tmp_path, stamp
 
 
 def test_parse_map__has_units_and_factors_of_any_sign():
-    mapped = parse_map("arm=Arm:-0.5,u_arm=Spool:permille,q_dot_arm=Rate,q_x=Hub:mm")
+    mapped = parse_map("arm=Arm:-0.5,u_arm=Spool:permille,q_dot_arm=Rate,q_x=Hub:-mm,time=t:h")
     expected = {"q_arm": ("Arm", -0.5), "u_arm": ("Spool", 0.001), "q_dot_arm": ("Rate", 1.0)}
-    assert mapped == expected | {"q_x": ("Hub", 0.001)}
+    assert mapped == expected | {"q_x": ("Hub", -0.001), "time": ("t", 3600)}
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_load_table__takes_numbers_as_names_and_datetimes_as_time(tmp_path, run)
     start, tick = np.datetime64("2026-01-02T03:04:05"), np.timedelta64(50, "ms")
     columns = {"time": start + np.arange(3) * tick, "u_a": np.zeros(3), "q_a": [b"0", b"1", b"2"]}
     np.savez(tmp_path / "3.npz", **columns | ({} if run is None else {"run": run}))
-    table = load_table(tmp_path / "3.npz", {})
+    table, _ = load_table(tmp_path / "3.npz", {})
     assert table["run"].tolist() == ["3"] * 3
     np.testing.assert_allclose(table["time"], [0, 0.05, 0.1])
     np.testing.assert_array_equal(table["q_a"], [0, 1, 2])

@@ -1,12 +1,21 @@
 """What a log tells: known joints are found again, and a log that cannot be of a machine is told."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from brokk_min.actuator import PLANT
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.fit import SINE, Log, Recording, collect, velocity_of
-from brokk_min.identification.inspection import JointReport, inspect, warnings, wrong_signs
+from brokk_min.identification.inspection import (
+    JointReport,
+    inspect,
+    repeated,
+    warnings,
+    wrong_signs,
+)
 from brokk_min.identification.validation import task_log
 from brokk_min.machine import BROKK_170
 
@@ -93,7 +102,7 @@ def test_inspect__names_recordings_in_which_angles_fall_under_positive_commands(
         one = record("boom", holds(seed, 800), stop=0.3)
         recordings.append(Recording(f"{seed}", one.u, sign * one.q, sign * one.q_dot))
     sines = [0.5 * np.sin(2 * np.pi * 2.5 * np.arange(ticks) / 20) for ticks in (100, 600)]
-    reports = inspect(log_of(*recordings, *(record("boom", sine) for sine in sines)))
+    reports = inspect(log_of(*recordings, *(record("boom", sine, 0.3) for sine in sines)))
     assert reports["boom"].opposite == ["1", "4"]
     (told,) = wrong_signs(reports)
     assert "in all recordings or in none, got some in ['1', '4']" in told
@@ -128,17 +137,43 @@ def test_inspect__sees_an_angle_to_the_ground(slope):
     assert len(told) == len(expected)
 
 
-GOOD = JointReport(20.0, -2.1, 2.1, (0.2, 0.2), [], {}, 1, 0.9, 0.1, (0.07, 0.07))
+GOOD = JointReport(
+    minutes=20.0, low=-2.1, high=2.1, fastest=(0.2, 0.2), largest=(0.5, 0.5), sign=1,
+    explained=0.9, coarse=0.95, delay=0.1, tau=0.1, dead_zone=(0.07, 0.07), step=0.01,
+    by_zones=0.9, still=[], opposite=[], follows={},
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
         ({}, []),
+        ({"minutes": 9.96, "delay": 0.4, "coarse": 0.97}, []),  # nothing that its figures deny
         ({"minutes": 9.0}, ["q1: expected 10 minutes, got 9.0"]),
         ({"low": -0.5}, ["q1: expected 70% of its range or more, got -0.50 to 2.10"]),
-        ({"high": 120.0}, ["q_q1: expected -2.14 to 2.14, got -2.10 to 120.00: another"]),
-        ({"explained": 0.05}, ["q1: expected 60% of its motion by its commands, got 5%"]),
+        ({"high": 120.0}, ["q_q1: expected -2.14 to 2.14, got -2.10 to 120.00: in degrees"]),
+        ({"high": 120.0, "low": -200.0}, ["q_q1: expected .* got -200.00 to 120.00: another zero"]),
+        ({"explained": 0.05, "coarse": 0.1}, ["q1: expected 60% of its motion .*, got 5%"]),
+        ({"explained": 0.4}, ["q_q1: expected angles finer than .* steps of 0.01 rad"]),
+        ({"explained": 0.4, "other": "q3"}, ["q1: expected motion by u_q1, got motion by u_q3"]),
+        ({"delay": 0.6}, ["q1: expected motion within 0.6 s", "history: .*, got 0.65 s"]),
+        ({"still": ["x"]}, ["q1: expected commands to move it, got .* .'x'."]),
+        ({"rest": 0.1}, ["u_q1: expected 0 at rest, got 0.1"]),
+        (
+            {"one_size": True},
+            ["u_q1: expected commands of many sizes, because .*, got one in each"],
+        ),
+        (
+            {"dead_zone": (0.27, 0.07), "by_zones": 0.8},
+            ["q1: .* dead_zone .0.07, 0.07., got .0.27"],
+        ),
+        ({"dead_zone": (0.27, 0.07)}, []),  # it explains as much as that of the machine
+        ({"fastest": (0.3, 0.2)}, ["q1: expected the machine's .* fastest motion, got .0.3, 0.2."]),
+        ({"fastest": (0.2, 0.05)}, []),
+        (
+            {"fastest": (0.2, 0.05), "largest": (0.1, 80 / 127)},
+            ["q1: expected the machine's .* fastest motion, got .0.2, 0.05."],
+        ),
         ({"opposite": ["x"]}, ["u_q1: expected positive commands to raise q_q1 in all"]),
         ({"sign": -1}, ["u_q1: expected positive commands to raise q_q1, got falling"]),
     ],
@@ -147,4 +182,89 @@ def test_warnings__know_what_a_log_lacks_and_where_it_contradicts_its_machine(ch
     log = Log(("q1",), (), warnings=("left out",))
     first, *found = warnings(log, {"q1": GOOD._replace(**changes)}, BROKK_170)
     assert first == "left out" and len(found) == len(expected)
-    assert all(text.startswith(start) for text, start in zip(found, expected, strict=True))
+    assert all(re.match(start, text) for text, start in zip(found, expected, strict=True))
+
+
+def boom(*commands, change=lambda one: one):
+    """The report of the boom, driven by each of these commands; `change` alters every third."""
+    each = [record("boom", u) for u in commands]
+    each[::3] = [change(one) for one in each[::3]]
+    each = [one._replace(name=str(i), q_dot=velocity_of(one.q, 4)) for i, one in enumerate(each)]
+    return inspect(log_of(*each))["boom"]
+
+
+SEVEN = [holds(seed, 800, 20) for seed in range(7)]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_inspect__names_recordings_in_which_commands_do_not_move_the_joint(share):
+    """The pump is off, or the engine stalls; dead zones and delay are those of the others."""
+
+    def stopped(one):
+        last = int(share * len(one.q))
+        return one._replace(q=np.where(np.arange(len(one.q))[:, None] < last, one.q, one.q[last]))
+
+    report = boom(*SEVEN, change=stopped)
+    assert report.still == ["0", "3", "6"] and report.explained > 0.95
+    assert report.dead_zone == pytest.approx((0.12, 0.20), abs=0.025)
+    assert boom(*SEVEN).still == []
+    everywhere = boom(*(0.5 * (u > 0) for u in SEVEN[:1]), change=stopped)
+    assert (everywhere.still == ["0"]) == (share == 0)
+
+
+def test_inspect__tells_steps_of_an_encoder_and_noise_from_another_motion():
+    step, rng = np.deg2rad(1.0), np.random.default_rng(0)
+    for spoil in (lambda q: np.rint(q / step) * step, lambda q: q + rng.normal(0, 0.008, q.shape)):
+        each = [record("boom", u) for u in SEVEN]
+        each = [one._replace(q=spoil(one.q)) for one in each]
+        report = inspect(log_of(*each))["boom"]
+        assert report.explained < 0.75 and report.coarse > 0.9
+        assert report.step == pytest.approx(step, rel=0.6)
+    assert boom(*SEVEN).coarse - boom(*SEVEN).explained < 0.05
+
+
+def test_inspect__names_the_joint_whose_commands_explain_a_motion():
+    swapped = [one._replace(u=one.u[:, ::-1]) for one in (record(name, holds()) for name in TRUE)]
+    reports = inspect(log_of(*swapped))
+    assert (reports["boom"].other, reports["arm"].other) == ("arm", "boom")
+
+
+def test_inspect__knows_commands_at_rest_and_switches():
+    pauses = [u * (np.arange(len(u)) % 200 < 100) for u in SEVEN]
+    shifted = [record("boom", u) for u in pauses]
+    shifted = [one._replace(u=one.u + 0.1) for one in shifted]
+    assert inspect(log_of(*shifted))["boom"].rest == pytest.approx(0.1)
+    parked = [one._replace(u=one.u + 0.15) for one in (record("boom", u) for u in SEVEN[:2])]
+    arm = [
+        one._replace(u=one.u + np.array([0.15, 0])) for one in (record("arm", u) for u in SEVEN[2:])
+    ]
+    assert inspect(log_of(*parked, *arm))["boom"].rest == pytest.approx(0.15)  # parked
+    switched = boom(*(np.sign(u) for u in pauses))
+    assert switched.one_size and switched.rest == 0.0
+    sound = boom(*pauses)
+    assert not sound.one_size and sound.rest == 0.0
+    upwards = boom(*(np.abs(u) for u in SEVEN))  # it rests under commands within the dead zone
+    assert upwards.rest == 0.0
+
+
+def test_inspect__compares_dead_zones_with_those_of_the_machine():
+    """The boom opens at 0.12 and 0.20."""
+    log = log_of(*(record("boom", u) for u in SEVEN))
+    for zone, differs in (((0.12, 0.20), False), ((0.07, 0.07), True), ((0.27, 0.27), True)):
+        joints = [
+            replace(BROKK_170.joints[i], name=name, dead_zone=zone) for i, name in enumerate(TRUE)
+        ]
+        machine = replace(BROKK_170, joints=tuple(joints), q_start=())
+        told = warnings(log, inspect(log, machine), machine)
+        assert any("boom: expected the machine's dead_zone" in text for text in told) == differs
+
+
+def test_repeated__names_recordings_that_are_there_twice():
+    """Also if a table has rounded them, and by another name; not two that stand still."""
+    first, other = record("boom", holds(0)), record("boom", holds(1))
+    again = first._replace(name="again", q=first.q.round(6))
+    rest = Recording("rest", *(np.zeros((50, 2)) for _ in range(3)))
+    assert repeated([first, other, again, rest, rest], ()) == ["again"]
+    assert repeated([other, again], [first]) == ["again"]
+    log = log_of(first, again)
+    assert "recordings: expected each once, got again ['again']" in warnings(log, {}, None)

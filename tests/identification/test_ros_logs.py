@@ -7,7 +7,9 @@ pytest.importorskip("rosbags")
 
 from helpers_ros import drive, joint_state, multi_array, record
 
-from brokk_min.identification.ros_logs import read_ros
+from brokk_min.identification.logs import read_log
+from brokk_min.identification.ros_logs import COMMAND_TIME, read_ros
+from brokk_min.machine import BROKK_170
 
 
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
@@ -20,14 +22,69 @@ def test_read_ros__has_angles_and_the_commands_that_hold(tmp_path, plugin, kind)
 
     path = record(tmp_path / "bag", drive(commands), plugin)
     path = path if plugin == "SQLITE3" else next(path.glob("*.mcap"))
-    table = read_ros(path, "/joint_states", "/valves")
-    k = np.arange(2, 20)  # the first command comes before the names of the joints
-    np.testing.assert_allclose(np.array(table["time"]) - 100, k / 20, atol=1e-6)
+    table, warnings = read_ros(path, "/joint_states", "/valves")
+    k = np.arange(20)
+    np.testing.assert_allclose(table["time"] - 100, k / 20, atol=1e-6)
     np.testing.assert_allclose(table["q_boom"], 0.01 * k)
     np.testing.assert_allclose(table["q_arm"], -0.02 * k)
-    np.testing.assert_allclose(table["u_boom"], k // 2 * 2 / 20)
-    np.testing.assert_allclose(table["u_arm"], -(k // 2 * 2) / 40)
+    np.testing.assert_allclose(table[COMMAND_TIME] - 100, k[::2] / 20 - 0.001, atol=1e-6)
+    np.testing.assert_allclose(table["u_boom"], k[::2] / 20)
+    np.testing.assert_allclose(table["u_arm"], -k[::2] / 40)
     assert ("q_wheel" in table) == (kind == "array")  # a joint without commands is left out
+    assert warnings == []
+
+
+def test_read_log__has_the_same_delay_as_a_table_if_commands_follow_the_angles(tmp_path):
+    """Each 3 ms after the angles that it answers: it holds from there, not from the row after."""
+    messages = []
+    for k in range(200):
+        messages.append((100 + k / 20, "/joint_states", joint_state(["boom"], [0.001 * k**1.5])))
+        messages.append((100.003 + k / 20, "/valves", joint_state(["boom"], [(k % 40) / 40])))
+    path = record(tmp_path / "bag", messages)
+    (recording,) = read_log(path, BROKK_170, topics=("/joint_states", "/valves")).recordings
+    k = np.arange(1, 200)
+    np.testing.assert_allclose(recording.q[:, 0], 0.001 * k**1.5, atol=0.004)
+    np.testing.assert_allclose(recording.u[1:, 0], (k[1:] % 40) / 40, atol=0.1)
+
+
+def test_read_ros__takes_stamps_of_headers_on_the_clock_of_the_recorder(tmp_path):
+    """The robot's clock is an hour behind, and messages come late by up to 45 ms."""
+    late = np.random.default_rng(0).uniform(0, 0.045, 60)
+    late[7] = 0.0
+    messages = [(99.9, "/valves", multi_array([0.5]))]
+    for k, x in enumerate(late):
+        q = joint_state(["boom"], [0.01 * k], stamp=7200 - 3600 + k / 20)
+        messages.append((100 + k / 20 + x, "/joint_states", q))
+    table, warnings = read_ros(record(tmp_path / "bag", messages), "/joint_states", "/valves")
+    np.testing.assert_allclose(table["time"] - 100, np.arange(60) / 20, atol=1e-6)
+    told = "/joint_states: expected stamps of the recorder as regular as the headers', got some"
+    assert len(warnings) == 1 and warnings[0].startswith(told)
+
+
+def test_read_ros__puts_together_what_several_nodes_send_and_says_so(tmp_path):
+    """Angles of the arm come 20 ms after those of the boom; ten were not read."""
+    messages = [(99.9, "/valves", multi_array([0.5, -0.5]))]
+    for k in range(60):
+        boom = np.nan if k < 10 else 0.01 * k
+        messages.append((100 + k / 20, "/joint_states", joint_state(["boom"], [boom])))
+        messages.append((100.02 + k / 20, "/joint_states", joint_state(["arm"], [-0.02 * k])))
+        messages.append((100.021 + k / 20, "/valves", multi_array([0.5, -0.5])))
+    path = record(tmp_path / "bag", messages)
+    table, warnings = read_ros(path, "/joint_states", "/valves")
+    assert warnings == ["/valves: expected one order of the joints, took ['boom', 'arm']"]
+    np.testing.assert_allclose(table["q_arm"][1:], -0.02 * (np.arange(1, 60) - 0.4), atol=1e-6)
+    np.testing.assert_array_equal(np.isnan(table["q_boom"]), np.arange(60) < 10)
+    log = read_log(path, BROKK_170, topics=("/joint_states", "/valves"))
+    assert [len(one.q) for one in log.recordings] == [50]
+    assert "bag: row 2: expected motion of q_boom, got a jump to nan" in log.warnings[1]
+
+
+def test_read_ros__warns_of_a_command_that_holds_for_long(tmp_path):
+    messages = drive(lambda k: multi_array([0.5, 0.0, 0.5]))
+    later = [(t + 3, topic, message) for t, topic, message in messages]
+    path = record(tmp_path / "bag", [*messages, *later])
+    (told,) = read_ros(path, "/joint_states", "/valves")[1]
+    assert told.startswith("/valves: expected a command every 0.1 s, got none for 2.1 s, while")
 
 
 def test_read_ros__names_what_is_missing(tmp_path):
@@ -35,6 +92,12 @@ def test_read_ros__names_what_is_missing(tmp_path):
     with pytest.raises(ValueError, match=r"bag: --topics: expected two of .*/valves.*got /u"):
         read_ros(path, "/joint_states", "/u")
     with pytest.raises(ValueError, match=r"commands: expected one of each \['boom', 'wheel', "):
+        read_ros(path, "/joint_states", "/valves")
+    refusal = r"bag: /valves: expected sensor_msgs/msg/JointState, got std_msgs/msg/Float64Multi"
+    with pytest.raises(ValueError, match=refusal):
+        read_ros(path, "/valves", "/joint_states")
+    path = record(tmp_path / "other", drive(lambda k: joint_state(["stick"], [0.1])))
+    with pytest.raises(ValueError, match=r"other: angles: expected those of \['stick'\]"):
         read_ros(path, "/joint_states", "/valves")
     (tmp_path / "x.mcap").write_bytes(b"no recording")
     with pytest.raises(ValueError, match=r"x\.mcap: expected a recording of ROS, got"):

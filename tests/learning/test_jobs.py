@@ -7,6 +7,7 @@ from functools import partial
 import psutil
 import pytest
 
+from brokk_min.learning import jobs
 from brokk_min.learning.jobs import side_by_side
 
 distributed = pytest.importorskip("distributed")
@@ -42,14 +43,22 @@ def test_side_by_side__calls_have_one_thread_and_no_other_computer_can_reach_the
     assert side_by_side(calls) == {"ports": {"127.0.0.1"}, "n": "1"}
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_side_by_side__on_a_cluster_whose_workers_have_one_thread(threads):
-    options = {"n_workers": 1, "processes": False, "dashboard_address": ":0", "protocol": "tcp"}
+@pytest.mark.parametrize("threads", [0, 1, 2])
+def test_side_by_side__on_a_cluster_whose_workers_have_one_thread(threads, monkeypatch):
+    monkeypatch.setattr(jobs, "PATIENCE", 0.1)
+    options = {
+        "n_workers": min(threads, 1),
+        "processes": False,
+        "dashboard_address": ":0",
+        "protocol": "tcp",
+    }
     with distributed.LocalCluster(threads_per_worker=threads, **options) as cluster:
         address = cluster.scheduler_address
         if threads == 1:
             assert side_by_side({"a": os.getpid}, scheduler=address) == {"a": os.getpid()}
         else:
-            message = rf"{address}: expected workers with --nthreads 1, got \[2\]"
+            none = f"{address}: expected a worker within 0.1 s, got none"
+            several = rf"{address}: expected workers with --nthreads 1, got \[2\]"
+            message = several if threads else none
             with pytest.raises(ValueError, match=message):
                 side_by_side({"a": os.getpid}, scheduler=address)

@@ -1,6 +1,7 @@
 """The machine as a value, the PWM code, the command limit, dead zones, encoders."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -37,7 +38,10 @@ BAD = [
     ({"joint": 1, "encoder_node": 1}, "joints: expected different CANopen nodes, got [1, 1, 3"),
     ({"controller_node": 3}, "joints: expected different CANopen nodes, got [1, 2, 3, 4, 5, 3]"),
     ({"joint": 3, "q_max": 0.6}, "q4.q_max: expected above 0.6, got 0.6"),
-    ({"joint": 3, "q_min": NAN}, "q4.q_max: expected above nan, got 2.9"),
+    ({"joint": 3, "q_min": NAN}, "q4.q_min: expected a finite number, got nan"),
+    ({"joint": 3, "a": "1.15"}, "q4.a: expected a finite number, got 1.15"),
+    ({"rate": INF}, "rate: expected a finite number, got inf"),
+    ({"history": 13.0}, "history: expected a whole number, got 13.0"),
     ({"joint": 3, "dead_zone": 0.1}, "q4.dead_zone: expected a pair, up and down, got 0.1"),
     ({"joint": 3, "kind": "screw"}, "q4.kind: expected revolute or prismatic, got screw"),
     ({"joint": 2, "q_dot_up": 0.0}, "q3.q_dot_up: expected a positive number, got 0.0"),
@@ -57,6 +61,16 @@ def test_a_bad_field__is_refused_by_name_with_wanted_and_got(changes, message):
     with pytest.raises(ValueError) as caught:
         changed(**changes)
     assert str(caught.value).startswith(message)
+
+
+def test_numbers_of_numpy__become_pythons_so_that_files_can_hold_them():
+    arrays = {"q_start": np.float32([1.5, 0.5, 0.5, 1.75, 1.25]), "rate": np.float32(20)}
+    machine = changed(pwm_limit=np.int64(80), history=np.array(13), **arrays)
+    machine = replace(machine, joints=changed(3, dead_zone=np.array([0.1, 0.2])).joints)
+    assert machine.joints[3].dead_zone == (0.1, 0.2)
+    plain = replace(machine, q_start=(1.5, 0.5, 0.5, 1.75, 1.25), rate=20.0, history=13)
+    assert repr(machine) == repr(plain)  # NumPy's numbers are printed as such
+    assert json.loads(json.dumps(asdict(machine)))["pwm_limit"] == 80
 
 
 @pytest.mark.parametrize(
