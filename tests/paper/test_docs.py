@@ -5,6 +5,7 @@
 
 import doctest
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from brokk_min.__main__ import COMMANDS, main
-from brokk_min._files import SHIPPED
+from brokk_min._files import SHIPPED, digest
 from brokk_min.machine import BROKK_170
 
 ROOT = Path(__file__).parents[2]
@@ -53,6 +54,30 @@ def test_readme__results_are_those_of_the_shipped_files() -> None:
     for name, (_, error, drift, _) in zip(SHOWN, rows, strict=True):
         assert f"{table[name]['velocity_error_mean']['mean']:.4f}" == error
         assert f"{table[name]['off_axis_drift_max']['mean']:.3f}" == drift
+
+
+@pytest.mark.parametrize("table", sorted(SHIPPED.rglob("*.json")), ids=lambda path: path.name)
+def test_shipped_tables__name_the_files_beside_them(table: Path) -> None:
+    """Seeds of a sweep are not shipped, but for the one that is the policy."""
+    meta = json.loads(table.read_text())["meta"]
+    beside = {name: digest(table.parent / name) for name in os.listdir(table.parent)}
+    for name, fingerprint in meta.get("files", {}).items():
+        assert name.startswith("seed_") or beside.get(name) == fingerprint, name
+
+
+CHANGED = re.compile(r"^\| (.+?) \| (\d\.\d{4}[^|]*(?: \| \d\.\d{4}[^|]*)*) \|$", re.M)
+
+
+def test_readme__errors_on_changed_machines_are_those_of_the_sweep() -> None:
+    """Columns: our agent, the strongest PID, with the paper's observation, the optimised PID."""
+    file = SHIPPED / "brokk170" / "robustness.json"
+    cases = json.loads(file.read_text())["robustness"] if file.exists() else {}
+    columns = ("rl", "jacobian_pid_ff_integral", "rl_paper", "jacobian_pid_k0.1")
+    rows = [row for row in CHANGED.findall(README.read_text()) if row[0] in cases]
+    assert bool(rows) == file.exists()
+    for name, cells in rows:
+        means = [f"{cases[name][controller]['mean']:.4f}" for controller in columns]
+        assert cells.split(" | ") == means, name
 
 
 def test_readme__lists_the_wings() -> None:
