@@ -110,6 +110,7 @@ def changes() -> dict[str, Schedule]:
     zones = M.dead_zones
     sticks = np.where(np.arange(M.n)[:, None] == M.driven[1], 0.03, 0.0)  # of the second joint
     return {
+        "oil warms up: 0.8 to 1.1 in 60 s": lambda t: faster(0.8 + 0.3 * min(t / 60, 1)),
         "oil warms up: 0.8 to 1.1 in 25 s": lambda t: faster(0.8 + 0.3 * min(t / 25, 1)),
         "load at 10 s: up -20 %, down +25 %": lambda t: faster([0.8, 1.25] if t >= 10 else 1.0),
         "a valve begins to stick within 20 s": lambda t: faster(

@@ -11,10 +11,12 @@ what the parts of our agent are worth in other learners.
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
 import numpy as np
+import torch
 from numpy.linalg import norm
 
 from benchmarks import POLICY, ladder
@@ -29,13 +31,15 @@ from brokk_min.evaluation.rollout import rollout
 from brokk_min.fit import SINE, collect
 from brokk_min.kinematics import forward_kinematics
 from brokk_min.learning import policy
+from brokk_min.learning.checkpoint import prepare
 from brokk_min.learning.recipes import find_recipe
-from brokk_min.machine import BROKK_170, PWM_MAX
+from brokk_min.machine import BROKK_170, PWM_MAX, Array
 
 M = BROKK_170
 LOW = M.column("q_min")
 HIGH = M.column("q_max")
 STEPS = 2_000_000  # of each training here
+WORLDS, WINDOWS = 256, 8  # of D10: machines, and windows before the one that is measured
 NETS_OF = ("policy.npz", "policy_critic.npz")  # shipped policies that learned on both nets
 Figures = dict[str, float]
 
@@ -91,6 +95,62 @@ def d9() -> Figures:
     return errors
 
 
+def d10() -> Figures:
+    """Weight that windows cut; part of the variance of A_t by groups due to the actions of t."""
+    result = {}
+    for name in ("policy.npz", "policy_paper.npz"):
+        trained = policy.load_policy(POLICY.with_name(name), M)
+        config = find_recipe(paper=trained.interface == "paper").learner
+        assert config.log_std_end is not None
+        T, gamma = config.horizon, config.gamma
+        result[f"{name}, cut"] = np.mean(gamma ** np.arange(1, T + 1))
+        for when, log_std in (("begins", config.log_std), ("ends", config.log_std_end)):
+            own, total = np.sum([own_variance(trained, log_std, seed) for seed in range(3)], axis=0)
+            result[f"{name}, {when}"] = own / total
+    return result
+
+
+def own_variance(trained: policy.Policy, log_std: float, seed: int) -> tuple[float, float]:
+    """Variance of A_t that the actions of tick t explain, and of A_t: means over a window.
+
+    The policy is frozen. Worlds begin in the same state and have noise of actions `a` before a
+    tick, and another noise `b` from it on. If they part at t + 1 they share the actions of t, and
+    if they part at t they do not, so in the first case the covariance of A_t with that of a world
+    of `a` alone is larger, by the variance that the actions of t explain, given their state.
+    """
+    recipe = find_recipe(paper=trained.interface == "paper")
+    T, num, std = recipe.learner.horizon, WORLDS, np.exp(log_std)
+    config = replace(recipe.learner, num_envs=num)
+    env, advantages, _ = prepare(M, trained.net, replace(recipe, learner=config), seed)
+    inner: Any = env.unwrapped
+    obs, rng = inner.episodes.obs, np.random.default_rng(seed)
+    for _ in range(WINDOWS * T):  # until machines move as they do in training
+        obs = env.step(trained.act(obs) + std * rng.standard_normal((num, len(M.driven))))[0]
+    episodes, state = inner.episodes, inner.np_random.bit_generator.state
+    a, b = rng.standard_normal((2, T, num, len(M.driven)))
+
+    def world(ticks: int) -> Array:
+        """Advantages (T, num) of a window with noise `a` for so many ticks, and `b` then."""
+        inner.episodes, inner.np_random.bit_generator.state = episodes, state
+        seen, rewards, dones, infos = episodes.obs, [], [], []
+        for noise in (*a[:ticks], *b[ticks:]):
+            seen, reward, terminated, truncated, info = env.step(trained.act(seen) + std * noise)
+            rewards.append(torch.tensor(reward, dtype=torch.float32))
+            dones.append(torch.tensor(terminated | truncated))
+            infos.append(info)
+        window: Any = SimpleNamespace(
+            rewards=torch.stack(rewards), dones=torch.stack(dones), infos=infos
+        )
+        agent: Any = None  # groups ask no critic
+        return np.asarray(advantages(agent, window, config)[0])
+
+    worlds = np.stack([world(ticks) for ticks in range(T + 1)])  # the last has `a` alone
+    with_action, without = worlds[1:], worlds[:-1]  # A_t of these is at [t, t]
+    t = np.arange(T)
+    own = (worlds[-1] * (with_action[t, t] - without[t, t])).mean()
+    return float(own), float(np.square(worlds[-1]).mean())
+
+
 def levels() -> Figures:
     """Fractions of samples: in the dead zone, and about the threshold of the valves."""
     result = {}
@@ -130,7 +190,7 @@ def trained() -> Figures:
     return result
 
 
-MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d9, levels)
+MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d9, d10, levels)
 
 
 def main(words: list[str]) -> None:

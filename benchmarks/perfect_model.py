@@ -1,7 +1,8 @@
-"""A bound: the error that a controller leaves which has the plant's equations and its exact state.
+"""A planner with the plant's equations and its exact state: the error that it leaves.
 
 Model-predictive control on the analytic plant. Like every other controller it gets no goal ahead
-of time: it plans as if the present goal lasted. Its error is the price of delay and dead time.
+of time: it plans as if the present goal lasted. It is one heuristic, which other controllers beat
+from some starts, so its error bounds nothing.
 
     python -m benchmarks.perfect_model [STARTS]
 """
@@ -51,7 +52,7 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True)
 class PerfectModel:
-    """The bound as a `Controller`: Gauss-Newton on a plan of valve openings at every tick.
+    """The planner as a `Controller`: Gauss-Newton on a plan of valve openings at every tick.
 
     It simulates the plant under its own commands, so its state is exact; of the measurements it
     reads the goal alone. While the tool rests, it closes the valves.
@@ -165,11 +166,11 @@ def steady_opening(machine: Machine, q: Array, goal: Array) -> Array:
 
 
 def main() -> None:
-    """Print the error of the bound along x, y and z, from the first starts, by default 16."""
+    """Print the error of the planner along x, y and z, from the first starts, by default 16."""
     machine = BROKK_170
     starts = evaluation_starts(machine, int(sys.argv[1]) if len(sys.argv) > 1 else 16, [], 0)
-    bound = {"perfect model": PerfectModel(machine, starts)}
-    runs, _ = evaluate(machine, bound, axis_sequences(machine), starts, 0)
+    planner = {"perfect model": PerfectModel(machine, starts)}
+    runs, _ = evaluate(machine, planner, axis_sequences(machine), starts, 0)
     for sequence, row in means(runs)["perfect model"].items():
         print(f"{sequence:4} velocity error {row['velocity_error_mean']['mean']:.4f} m/s")
 

@@ -5,13 +5,16 @@ complete. What a file should hold and does not is a ValueError of one line: file
 """
 
 import csv
+import hashlib
 import json
 import os
 import shutil
+import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
+from types import ModuleType
 from typing import IO, Any
 
 import numpy as np
@@ -32,6 +35,39 @@ def require_package(package: str, extra: str) -> Any:
     except ImportError as error:
         wanted = f"pip install -c constraints.txt -e '.[{extra}]'"
         raise ValueError(f"{package}: expected {wanted}, got {error}") from error
+
+
+def digest(path: Path) -> str:
+    """The first 16 digits of the SHA-256 of a file, by which tables name the files they scored."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def constants(*modules: ModuleType) -> dict[str, dict[str, float]]:
+    """The numbers that modules name in capitals; what was made with others is refused by name."""
+    return {
+        module.__name__: {
+            name: value
+            for name, value in vars(module).items()
+            if name.isupper() and isinstance(value, (int, float))
+        }
+        for module in modules
+    }
+
+
+def made_with() -> dict[str, str | None]:
+    """Versions of the package, torch and NumPy, and the commit of a clone; None: there is none."""
+    versions: dict[str, str | None] = {}
+    for package in ("brokk_min", "torch", "numpy"):
+        versions[package] = None
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    root = Path(__file__).parents[1]
+    call = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
+    with suppress(OSError):  # without git
+        if (root / ".git").exists():
+            told = subprocess.run(call, capture_output=True, text=True, check=False).stdout
+            return versions | {"commit": told.strip() or None}
+    return versions | {"commit": None}
 
 
 @contextmanager

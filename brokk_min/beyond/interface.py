@@ -59,6 +59,7 @@ INTEGRAL_TIME = 4.0  # s, tuned: time constant of the error integral's leak
 ALONG, ACROSS = 0.02, 0.07  # of tool_speed, tuned: velocity errors count up to here
 COMPENSATION = 0.01  # of an action, assumed: up to here a command rises to the dead zone
 REST_AFTER = 0.1  # s of a zero goal, after which the valves close (tuned)
+DAMPED = 0.06  # of the length of the arm, assumed: lambda of resolved velocities
 FADE = 2 / 13  # of the history, tuned: e-fold of the weights of older velocities and commands
 WIDER, EARLY, LATE = 1.25, 0.25, 0.4  # tuned: times as wide, s after a valve was last closed
 EFFORT_COST = 0.03  # tuned: if all commands are at the limit
@@ -172,7 +173,7 @@ class OurInterface(env.Interface):
         q[..., driven] = smooth_angles(machine, measured.history)
         J = jacobian(forward_kinematics(machine, q))[..., driven]
         arm = np.hypot(machine.column("a"), machine.column("d")).sum()
-        J_inv = dls(J, np.ones(len(driven)), (0.06 * arm) ** 2)  # lambda: 6 % of the arm, assumed
+        J_inv = dls(J, np.ones(len(driven)), (DAMPED * arm) ** 2)
         newest = measured.history[..., -(machine.history // 2) :]
         q_dot, u = newest[..., 1, :], newest[..., 2, :]
         opens = open_indicator(opening(u, machine.dead_zones[driven].astype(u.dtype)))

@@ -76,8 +76,8 @@ class Evaluate(Command):
             return baselines.read_gains(path, machine, net)
         tuned = baselines.tuned_baselines(machine, net, baselines.EFFORT, self.seed, plant)
         if self.save_gains:
-            meta = {"effort": baselines.EFFORT, "seed": self.seed, "plant": self.plant}
-            meta |= baselines.gains_metadata(machine, net)
+            meta = metrics.metadata(machine, self.seed) | baselines.gains_metadata(machine, net)
+            meta |= {"effort": baselines.EFFORT, "plant": self.plant}
             baselines.write_gains(self.save_gains, tuned, meta)
         return tuned
 
@@ -85,11 +85,12 @@ class Evaluate(Command):
 def table(runs: Sequence[metrics.Run]) -> str:
     """Means by controller."""
     num, motions = (len(metrics.column(runs, label)) for label in ("start", "sequence"))
-    row = "{:38}{:>15}" + "{:>15}" * len(metrics.COLUMNS)
+    row = "{:56}{:>15}" + "{:>15}" * len(metrics.COLUMNS)
     lines = [f"means over {motions} sequences from {num} starts"]
     lines.append(row.format("", "valves at rest", *metrics.COLUMNS.values()))
     for name, rows in metrics.means(runs).items():
-        cells = (f"{rows['all'][key]['mean']:.4g}" for key in metrics.COLUMNS)
+        numbers = (rows["all"][key]["mean"] for key in metrics.COLUMNS)
+        cells = ("-" if x is None else f"{x:.4g}" for x in numbers)
         lines.append(row.format(title(name), valves_at_rest(name), *cells))
     return "\n".join(lines)
 

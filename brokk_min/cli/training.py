@@ -79,6 +79,7 @@ class Sweep(Training):
     seeds: int = 10  # How many, from --seed on.
     scheduler: str | None = None  # tcp://... of dask; its workers must see OUT. None: this machine.
     num_starts: int = 16  # Start poses for each scored sequence.
+    robustness: Path | None = None  # Also on changed machines, beside this folder's controllers.
 
     def __call__(self, machine: Machine) -> None:
         recipe = self.recipe()
@@ -89,6 +90,7 @@ class Sweep(Training):
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         seeds = range(self.seed, self.seed + self.seeds)
         net = load_net(self.actuator, machine)
-        table = sweep(machine, net, recipe, seeds, self.out, self.num_starts, self.scheduler)
+        task = machine, net, recipe, seeds, self.out, self.num_starts
+        table = sweep(*task, self.scheduler, self.robustness)
         print("mean over seeds (95 % interval)")
         print("\n".join(f"{key:24} {interval_text(table['all'][key])}" for key in COLUMNS))

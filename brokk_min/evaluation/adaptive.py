@@ -31,6 +31,7 @@ def cold_and_warm(
     rows: int,
     motions: list[tuple[Array, Array]],
     plant: Plant = PLANT,
+    noise: float = TaskConfig.noise,
 ) -> dict[str, Controller]:
     """Each controller of `machine` twice: it knows nothing, or has driven `truth` for a minute.
 
@@ -42,7 +43,7 @@ def cold_and_warm(
         warm = Adaptive(controller, net, machine)
         for part, motion in enumerate(motions):
             rng = np.random.default_rng(SEED + part)
-            rollout(truth, warm, *motion, TaskConfig.noise, rng, plant)
+            rollout(truth, warm, *motion, noise, rng, plant)
         assert warm.known is not None  # it has driven
         warm.known = Known(*(np.resize(of, (rows, *of.shape[1:])) for of in warm.known))
         result[f"{name}+warm"] = warm

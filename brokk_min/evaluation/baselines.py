@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from brokk_min._files import expect_same, expected, write_json
+from brokk_min import jacobian
+from brokk_min._files import constants, expect_same, expected, write_json
 from brokk_min.actuator import PLANT, ActuatorNet, Plant
+from brokk_min.beyond import interface, strong_pid
 from brokk_min.beyond.strong_pid import StrongGains, StrongPID, static_map
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
@@ -184,7 +186,7 @@ def tune(gains: Gains, cost: Callable[[Any], Array], seed: int, generations: int
 def tuned_baselines(
     machine: Machine, net: ActuatorNet, effort: Effort, seed: int, plant: Plant = PLANT
 ) -> Baselines:
-    """The `baselines`, tuned on the `plant` itself, which favours them: policies see nets alone."""
+    """The `baselines`, tuned on the `plant` itself, which favours them: policies learn on nets."""
     generations, num, seconds = effort
     runs = tuning_set(machine, num, seed, seconds)
     gains = first_gains(machine, plant)
@@ -195,9 +197,10 @@ def tuned_baselines(
     return baselines(machine, net, gains)
 
 
-def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, str]:
-    """Machine and nets to which gains belong: its name, and the nets' fingerprint."""
-    return {"machine": machine.name, "actuator": fingerprint(net)}
+def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, Any]:
+    """What gains belong to: a machine, by its name, nets, by their fingerprint, and constants."""
+    about = {"machine": machine.name, "actuator": fingerprint(net)}
+    return about | {"constants": constants(interface, jacobian, strong_pid)}
 
 
 def write_gains(path: Path, pids: Baselines, meta: Mapping[str, Any]) -> None:

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, RAW
-from brokk_min.evaluation.metrics import Mean, Run, by_start, mean_interval
+from brokk_min.evaluation.metrics import Mean, Run, by_start, column, interval_text, mean_interval
 from brokk_min.evaluation.preliminary import Gap, Tests, response_time
 from brokk_min.evaluation.rollout import TITLES
 
 TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-JUDGED = ("rl_paper", "rl_critic")  # the paper's agent
+JUDGED = ("rl_critic", "rl_critic_nets", "rl_paper")  # the paper's learner, and groups
 PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure, by hand first
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
 SHORT = {ERROR: "error", DRIFT: "drift"}  # in columns
@@ -61,7 +61,8 @@ def net_claims(nets: Tests, gap: Gap) -> list[dict[str, Any]]:
 
 
 def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """The claims on the paper's agent and each PID. Paper: Sec. 4.2 and 5, Fig. 6"""
+    """The claims on each policy of `JUDGED` that has runs, and PID. Paper: Sec. 4.2, 5, Fig. 6"""
+    judged = [name for name in JUDGED if name in column(runs, "controller")]
 
     def drift(names: Sequence[str]) -> dict[str, dict[str, Mean]]:
         """Of each controller, along x."""
@@ -70,7 +71,7 @@ def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
     def less(sequences: Sequence[str], keys: Sequence[str] = (ERROR,)) -> dict[str, Any]:
         """Figures of each policy less those of each PID: negative where the policy is better."""
         numbers: dict[str, dict[str, Mean]] = {}
-        for policy, pid in product(JUDGED, PIDS):
+        for policy, pid in product(judged, PIDS):
             row = numbers[f"{TITLES[policy]} against {TITLES[pid]}"] = {}
             for s, key in product(sequences, keys):
                 difference = by_start(runs, policy, s, key) - by_start(runs, pid, s, key)
@@ -78,9 +79,25 @@ def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
         return numbers
 
     return [
-        claim("still", drift(JUDGED)),
+        claim("still", drift(judged)),
         claim("drift", drift(PIDS)),
         claim("tracking", less("xyz")),
         claim("along_z", less("z", (ERROR, DRIFT))),
         claim("outperforms", less(["all"])),
     ]
+
+
+def verdict_rows(claims: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """A table of all claims: figure, the paper's words, what is judged, its figures, its verdict.
+
+    Of the comparisons with PIDs it has those with the optimised one.
+    """
+    rows = []
+    for claim in claims:
+        for judged, numbers in claim["numbers"].items():
+            _, against, pid = judged.partition(" against ")
+            if not against or pid == TITLES[OPTIMISED]:
+                texts = [f"{what} {interval_text(number)}" for what, number in numbers.items()]
+                words = [claim["figure"], claim["paper"], judged, "; ".join(texts)]
+                rows.append([*words, claim["verdicts"][judged]])
+    return rows

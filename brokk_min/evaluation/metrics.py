@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 from numpy.linalg import norm
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from brokk_min import __version__
+from brokk_min._files import made_with
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import reward
 from brokk_min.evaluation.rollout import Trace, rollout
@@ -23,8 +24,12 @@ Run = Mapping[str, Any]  # controller, sequence, start, kind, then the figures o
 Table = list[dict[str, Any]]  # of one `Run` each
 Mean = Mapping[str, float | None]  # "mean", and its interval "low" to "high"
 LABELS = ("controller", "sequence", "start", "kind", "seed")  # of a row; the seed is of a sweep
+SETTLING = 1.0  # s after a change of goal, in which an error is transient
+JUMP = 0.05  # of tool_speed, assumed: a change of goal in a tick; the circle turns by less
 COLUMNS = {  # of tables, with their heads
     "velocity_error_mean": "error [m/s]",
+    "velocity_error_transient": "transient",
+    "velocity_error_steady": "steady",
     "off_axis_drift_max": "drift [m]",
     "jerk_rms": "jerk [m/s^3]",
     "valve_travel": "travel [1]",
@@ -35,20 +40,41 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
     """Figures of each run as in the evaluate JSON, (num,) each.
 
     m, m/s, m/s^3; valve travel in full strokes; reward 1. `goals` [m/s] (T, num, 3), `start`
-    tool positions before the first tick [m] (num, 3).
+    tool positions before the first tick [m] (num, 3). Errors are transient in the first second
+    after a change of goal, and steady in the rest (Kunapuli et al., RSS 2025, arXiv 2506.17832);
+    nan where a run has none.
     """
     error = norm(goals - trace.v_tool, axis=-1)
+    transient = after_a_change(machine, goals)
     drift = line_distance(trace.p_tool, goals, start)
     jerk = np.diff(trace.v_tool, n=2, axis=0) * machine.rate**2
     return {
         "velocity_rmse": np.sqrt(np.mean(error**2, axis=0)),
         "velocity_error_mean": error.mean(axis=0),
+        "velocity_error_transient": mean_where(transient, error),
+        "velocity_error_steady": mean_where(~transient, error),
         "off_axis_drift_max": drift.max(axis=0),
         "off_axis_drift_mean": drift.mean(axis=0),
         "jerk_rms": np.sqrt(np.sum(jerk**2, axis=-1).sum(axis=0) / max(1, len(jerk))),
         "valve_travel": np.abs(np.diff(trace.u, axis=0, prepend=0 * trace.u[:1])).sum(axis=(0, 2)),
         "reward_mean": reward(goals, trace.v_tool).mean(axis=0),
     }
+
+
+def after_a_change(machine: Machine, goals: Array) -> NDArray[np.bool_]:
+    """Has the goal jumped within the last second? (T, num) of goals [m/s] (T, num, 3)."""
+    change = norm(np.diff(goals, axis=0, prepend=0 * goals[:1]), axis=-1)
+    jumps = np.cumsum(change > JUMP * machine.tool_speed, axis=0)
+    ticks = round(SETTLING * machine.rate)
+    earlier = np.concatenate([np.zeros_like(jumps[:1]).repeat(ticks, axis=0), jumps])[: len(jumps)]
+    return np.asarray(jumps > earlier)
+
+
+def mean_where(chosen: NDArray[np.bool_], values: Array) -> Array:
+    """Mean of each run's values (T, num) where they are chosen; nan where none is."""
+    count = chosen.sum(axis=0)
+    total = np.where(chosen, values, 0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
@@ -80,11 +106,12 @@ def evaluate(
     starts: Array,
     seed: int,
     plant: Plant = PLANT,
+    noise: float = TaskConfig.noise,
 ) -> tuple[Table, Traces]:
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
-    `starts` are angles [rad] (starts, n). The sensors have the noise of training. Returns one row
-    per controller, sequence and start, see `metrics`; and traces.
+    `starts` are angles [rad] (starts, n); `noise` of the sensors is that of training. Returns one
+    row per controller, sequence and start, see `metrics`, with None for nan; and traces.
     """
     p_start = tool_position(forward_kinematics(machine, starts))
     goals = {s.name: s.for_starts(machine, starts) for s in sequences}  # all are one batch
@@ -95,14 +122,15 @@ def evaluate(
     traces: dict[tuple[str, str], Trace] = {}
     for name, controller in tqdm(controllers.items(), "evaluate", unit="controller", disable=None):
         rng = np.random.default_rng(seed)
-        every = rollout(machine, controller, q, batch, TaskConfig.noise, rng, plant)
+        every = rollout(machine, controller, q, batch, noise, rng, plant)
         for i, (sequence, goal) in enumerate(goals.items()):
             part = slice(i * len(starts), (i + 1) * len(starts))
             trace = Trace(*(array[: len(goal), part] for array in every))
             columns = metrics(machine, trace, goal, p_start)
             for start in range(len(starts)):
                 labels = {"controller": name, "sequence": sequence, "start": start}
-                figures = {key: float(of[start]) for key, of in columns.items()}
+                row = {key: float(of[start]) for key, of in columns.items()}
+                figures = {key: None if np.isnan(x) else x for key, x in row.items()}
                 rows.append(labels | {"kind": "workspace"} | figures)
             traces[name, sequence] = trace
     return rows, traces
@@ -110,21 +138,21 @@ def evaluate(
 
 def metadata(machine: Machine, seed: int) -> dict[str, Any]:
     """Metadata of every JSON file of results."""
-    about = {"brokk_min": __version__, "machine": machine.name, "seed": seed}
-    return about | {"units": "m, m/s, s, rad"}
+    return made_with() | {"machine": machine.name, "seed": seed, "units": "m, m/s, s, rad"}
 
 
 def by_start(runs: Sequence[Run], controller: str, sequence: str, key: str) -> Array:
-    """One figure for each start (starts,), mean of its runs; `sequence` may be "all"."""
+    """One figure for each start (starts,), the mean of its runs that have one."""
     values: dict[int, list[float]] = {}
     for run in runs:
-        if run["controller"] == controller and sequence in (run["sequence"], "all"):
+        mine = run["controller"] == controller and sequence in (run["sequence"], "all")
+        if mine and run[key] is not None:
             values.setdefault(run["start"], []).append(run[key])
     return np.array([np.mean(of) for _, of in sorted(values.items())])
 
 
 def mean_interval(values: Array) -> Mean:
-    """Mean, and its 95 % confidence interval by Student's t; without two values that is None.
+    """Mean, and its 95 % confidence interval by Student's t; None for what too few values have.
 
     Example:
         >>> {key: round(x, 3) for key, x in mean_interval(np.array([1.0, 2.0, 3.0])).items()}
@@ -132,8 +160,8 @@ def mean_interval(values: Array) -> Mean:
     """
     from scipy.special import stdtrit  # Student's t quantile; slow to import
 
-    mean = float(values.mean())
-    if len(values) == 1:
+    mean = float(values.mean()) if len(values) else None
+    if mean is None or len(values) == 1:
         return {"mean": mean, "low": None, "high": None}
     half = stdtrit(len(values) - 1, 0.975) * values.std(ddof=1) / math.sqrt(len(values))
     return {"mean": mean, "low": float(mean - half), "high": float(mean + half)}
@@ -164,3 +192,23 @@ def means(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, Mean]]]:
         c: {s: {k: mean_interval(by_start(runs, c, s, k)) for k in keys} for s in sequences}
         for c in column(runs, "controller")
     }
+
+
+def compare(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, dict[str, Any]]:
+    """How much less or more a figure is with `one` controller than with the `other`, by sequence.
+
+    "mean" with its interval is the difference of runs from the same starts [% of the other's mean],
+    and `one` has the smaller figure in "won" of so many "runs". The sequence "all" has all runs.
+    """
+    result = {}
+    for sequence in [*column(runs, "sequence"), "all"]:
+        mine, its = (by_start(runs, name, sequence, key) for name in (one, other))
+        whole = its.mean() if len(its) else np.nan
+        row: dict[str, Any] = dict(mean_interval(100 * (mine - its) / whole))
+        parts = [sequence] if sequence != "all" else column(runs, "sequence")
+        won = [by_start(runs, one, of, key) < by_start(runs, other, of, key) for of in parts]
+        result[sequence] = row | {
+            "won": sum(of.sum().item() for of in won),
+            "runs": sum(map(len, won)),
+        }
+    return result

@@ -17,20 +17,19 @@ from tqdm import tqdm
 
 from brokk_min._files import SHIPPED, whole_file
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST
+from brokk_min.evaluation.claims import verdict_rows
 from brokk_min.evaluation.metrics import COLUMNS, Mean, Traces, interval_text
 from brokk_min.evaluation.preliminary import Curves, Gap, Tests
 from brokk_min.evaluation.rollout import TITLES, title, valves_at_rest
 from brokk_min.evaluation.sequences import AXES, Commands, axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_position
-from brokk_min.machine import BROKK_170, Array, Machine
+from brokk_min.machine import Array, Machine
 
 Results = Mapping[str, Any]  # of `results.json`
 Row = tuple[Sequence[str], Mapping[str, Array]]  # of plots: labels, and curves (T, labels) by name
 Shown = tuple[Mapping[str, Tests], Gap, Traces]  # of machine and nets, nets less machine
-ROWS = (BY_HAND, OPTIMISED, "rl_paper", "rl", STRONGEST)
-PAIRS = (("rl_paper", BY_HAND), ("rl_paper", OPTIMISED), ("rl", STRONGEST))  # within a class
+ROWS = (BY_HAND, OPTIMISED, "rl_critic", "rl_critic_nets", "rl_paper", "rl", STRONGEST)
 SAMPLE = ("rl_paper", "rl_critic", BY_HAND, OPTIMISED)  # drawn in Fig. 6
-BOUND = 0.0097  # m/s, of `benchmarks/perfect_model.py`, which knows the plant of the Brokk 170
 WIDTH = 10.0  # inch, of every figure, so that letters have one size in the report
 LINES = ("-", "--", "-.", ":")  # beside colours, for the colour-blind
 
@@ -39,9 +38,9 @@ LINES = ("-", "--", "-.", ":")  # beside colours, for the colour-blind
 def write_report(out: Path, machine: Machine, results: Results, measured: Shown) -> None:
     """Write `report.html` to the folder `out`; `measured` is what the paper's figures show."""
     tests, gap, traces = measured
-    starts, table = np.array(results["starts"]), first_table(results)
+    starts, table = np.array(results["starts"]), headline(results)["table"]
     drawn = {
-        "errors": plot_errors({c: table[c]["velocity_error_mean"] for c in ROWS}),
+        "errors": plot_errors({c: table[c]["velocity_error_mean"] for c in ROWS if c in table}),
         "tests": plot_tests(machine, tests),
         "gap": plot_gap(machine, gap),
         "starts": plot_starts(machine, starts),
@@ -61,21 +60,22 @@ def png(figure: Figure) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def first_table(results: Results) -> Any:
-    """Means along x, y and z: those of the package for a trial, which are of the full chain."""
+def headline(results: Results) -> Any:
+    """What the page begins with: for a trial what the package has, which is of the full chain."""
     shipped = SHIPPED / results["meta"]["machine"] / "table.json"
     trial = results["meta"]["effort"]["hours"] < 1 and shipped.exists()
-    return (json.loads(shipped.read_text("utf-8")) if trial else results)["table"]
+    return json.loads(shipped.read_text("utf-8")) if trial else results
 
 
 def render(results: Results, images: Mapping[str, str]) -> str:
     """The page, with PNG `images` in base64 by name."""
-    bound = BOUND if results["meta"]["machine"] == BROKK_170.name else None
     text = Path(__file__).with_suffix(".html.j2").read_text("utf-8")
     page: Template = Template(text, autoescape=True, undefined=StrictUndefined)
-    page.globals.update(rows=ROWS, pairs=PAIRS, columns=COLUMNS, title=title)
-    page.globals.update(rest=valves_at_rest, interval=interval_text)
-    return page.render(results=results, images=images, bound=bound, table=first_table(results))
+    page.globals.update(columns=COLUMNS, title=title, rest=valves_at_rest)
+    page.globals.update(interval=interval_text, verdict_rows=verdict_rows)
+    first = headline(results)
+    rows = [name for name in ROWS if name in first["table"]]
+    return page.render(results=results, images=images, first=first, rows=rows)
 
 
 # --- figures --------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min._files import write_csv, write_json
+from brokk_min._files import digest, write_csv, write_json
 from brokk_min.actuator import PLANT, ActuatorNet, Plant, hydraulics_of
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.evaluation import (
@@ -28,9 +28,19 @@ from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, Policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import Array, Machine
+from brokk_min.settings import TaskConfig
 
-# beyond the chain's: sixth in error of the seeds 0 to 9, of a critic third of 0 to 3
-MEDIAN_SEEDS = {"rl": 8, "rl_paper": 5, "rl_critic": 3}
+# beyond the chain's: sixth in error of the seeds 0 to 9, of `rl_critic` third of 0 to 3
+SEEDS = {"rl": 8, "rl_paper": 5, "rl_critic": 3, "rl_critic_nets": 0}  # the last not chosen
+TRAINED = POLICIES | {"rl_critic_nets": "policy_critic_nets.npz"}  # for the tables alone
+CRITIC_STEPS = 60_000_000  # of the paper's learner on our nets
+PAIRS = (  # of a policy and a PID, that the pages compare
+    ("rl_critic_nets", baselines.OPTIMISED),
+    ("rl_paper", baselines.BY_HAND),
+    ("rl_paper", baselines.OPTIMISED),
+    ("rl", baselines.STRONGEST),
+)
+COMPARED = ("velocity_error_mean", "off_axis_drift_max", "jerk_rms")  # figures of pairs
 
 
 @dataclass(frozen=True)
@@ -61,15 +71,16 @@ class Chain:
 def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[str, Any]:
     """Run the chain; logs, nets, policies, gains, starts, results and `report.html` go to `out`.
 
-    `table.json` has the means along x, y and z alone. The same seed gives the same files again.
+    `table.json` is what pages quote: means along x, y and z, pairs motion by motion, and verdicts.
+    The same seed gives the same files again.
     """
     chain = Chain(machine, out, budget, seed)
     out.mkdir(parents=True, exist_ok=True)
     done = learn(chain, record_log(chain, RICH, "log"), record_log(chain, SINE, "log_paper"))
     results, measured = measure_all(chain, done)
     write_json(out / "results.json", results)
-    write_json(out / "table.json", {key: results[key] for key in ("meta", "table")})
-    baselines.write_gains(out / "gains.json", done["pids"], results["meta"])
+    keys = ("meta", "table", "pairs", "claims")
+    write_json(out / "table.json", {key: results[key] for key in keys})
     report.write_report(out, machine, results, measured)
     return results
 
@@ -91,12 +102,13 @@ def fit_net(chain: Chain, name: str, log: Log, recipe: Mapping[str, Any]) -> Act
 
 
 def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
-    """One of `POLICIES`, by its own recipe."""
-    recipe = find_recipe(paper=name != "rl", critic=name == "rl_critic")
-    steps = chain.budget.train_steps or recipe.learner.total_steps
+    """One of `TRAINED`, by its own recipe."""
+    recipe = find_recipe(paper=name != "rl", critic=name.startswith("rl_critic"))
+    longest = CRITIC_STEPS if name == "rl_critic_nets" else recipe.learner.total_steps
+    steps = chain.budget.train_steps or longest
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=steps))
-    driven, seed = select_nets(chain.machine, net), chain.seed + MEDIAN_SEEDS[name]
-    return train_policy(chain.machine, driven, recipe, seed, chain.out / POLICIES[name])
+    driven, seed = select_nets(chain.machine, net), chain.seed + SEEDS[name]
+    return train_policy(chain.machine, driven, recipe, seed, chain.out / TRAINED[name])
 
 
 def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
@@ -105,12 +117,13 @@ def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
     jobs: dict[str, Callable[..., Any]] = {
         "net": partial(fit_net, chain, "net", log, {}),
         "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
-        "rl_paper": partial(train_one, chain, "rl_paper"),  # the longest first
+        "rl_critic_nets": partial(train_one, chain, "rl_critic_nets"),  # the longest first
+        "rl_paper": partial(train_one, chain, "rl_paper"),
         "rl_critic": partial(train_one, chain, "rl_critic"),
         "rl": partial(train_one, chain, "rl"),
         "pids": partial(tune, effort=chain.budget.tuning, seed=chain.seed),
     }
-    needs = {"rl_paper": ["net"], "rl_critic": ["net_paper"], "rl": ["net"], "pids": ["net"]}
+    needs = {name: ["net"] for name in (*TRAINED, "pids")} | {"rl_critic": ["net_paper"]}
     return side_by_side(jobs, needs)
 
 
@@ -118,7 +131,7 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
     """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
     net = select_nets(machine, done["net"])
-    controllers = {name: done[name] for name in POLICIES} | done["pids"]
+    controllers = {name: done[name] for name in TRAINED} | done["pids"]
     commands = sequences.task_sequences(machine)
     starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
     write_csv(chain.out / "starts.csv", machine.names, starts.tolist())
@@ -130,15 +143,29 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
     runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
     along = metrics.means([run for run in runs if run["sequence"] in sequences.AXES])
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, net)
+    meta |= {"effort": asdict(budget)}
+    baselines.write_gains(chain.out / "gains.json", done["pids"], meta)
+    files = [*TRAINED.values(), "gains.json"]
     results = {
-        "meta": meta | {"effort": asdict(budget)},
+        "meta": meta | {"files": {file: digest(chain.out / file) for file in files}},
         "table": {name: of["all"] for name, of in along.items()},
         "task_space": {"runs": runs, "means": metrics.means(runs)},
+        "pairs": compare_pairs(runs),
         "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
-        "robustness": robustness(machine, controllers, net, short, starts[:16], seed),
+        "robustness": mean_errors(robustness(machine, controllers, net, short, starts[:16], seed)),
         "starts": starts.tolist(),
     }
     return results, (tests, gap, traces)
+
+
+def compare_pairs(runs: Sequence[metrics.Run]) -> list[dict[str, Any]]:
+    """Of each of `PAIRS` that was scored the differences, motion by motion, see `compare`."""
+    scored, rows = metrics.column(runs, "controller"), []
+    for policy, pid in PAIRS:
+        if policy in scored:
+            figures = {key: metrics.compare(runs, policy, pid, key) for key in COMPARED}
+            rows.append({"policy": policy, "pid": pid, "figures": figures})
+    return rows
 
 
 def variations(machine: Machine) -> dict[str, Machine]:
@@ -167,19 +194,32 @@ def robustness(
     commands: Sequence[sequences.Commands],
     starts: Array,
     seed: int,
-) -> dict[str, dict[str, metrics.Mean]]:
-    """Mean velocity error [m/s] with its interval, by variation and controller. Paper: Sec. 4.2
+) -> dict[str, metrics.Table]:
+    """Runs on each of the `variations`, with faster goals and other noise. Paper: Sec. 4.2
 
     Each controller is also there cold and warm, as it learns its valves by `beyond.adaptation`.
     """
-    cases = {name: (varied, commands) for name, varied in variations(machine).items()}
-    cases["goals +50 %"] = machine, [one._replace(goals=1.5 * one.goals) for one in commands]
+    usual = TaskConfig.noise
+    cases = {name: (varied, commands, usual) for name, varied in variations(machine).items()}
+    faster = [one._replace(goals=1.5 * one.goals) for one in commands]
+    cases["goals +50 %"] = machine, faster, usual
+    cases["no sensor noise"] = machine, commands, 0.0
+    cases["twice the sensor noise"] = machine, commands, 2 * usual
     rows, longest = len(commands) * len(starts), max(len(one.goals) for one in commands)
     motions = adaptive.warm_up_motions(machine, min(adaptive.SECONDS, longest * machine.dt))
-    result: dict[str, dict[str, metrics.Mean]] = {}
-    for name, (varied, moves) in cases.items():
-        learners = adaptive.cold_and_warm(controllers, net, machine, varied, rows, motions)
-        runs, _ = metrics.evaluate(varied, {**controllers, **learners}, moves, starts, seed)
-        means = metrics.means(runs)
-        result[name] = {c: of["all"]["velocity_error_mean"] for c, of in means.items()}
+    result: dict[str, metrics.Table] = {}
+    for name, (varied, moves, noise) in cases.items():
+        learners = adaptive.cold_and_warm(
+            controllers, net, machine, varied, rows, motions, noise=noise
+        )
+        every = {**controllers, **learners}
+        result[name], _ = metrics.evaluate(varied, every, moves, starts, seed, noise=noise)
     return result
+
+
+def mean_errors(cases: Mapping[str, metrics.Table]) -> dict[str, dict[str, metrics.Mean]]:
+    """Mean velocity error [m/s] with its interval, by variation and controller."""
+    return {
+        name: {c: of["all"]["velocity_error_mean"] for c, of in metrics.means(runs).items()}
+        for name, runs in cases.items()
+    }

@@ -15,8 +15,9 @@ TITLES = {  # of controllers in tables, figures and windows, by their names in f
     "pid_by_hand_raw": "PID by hand, raw",
     "pid_by_hand": "PID by hand",
     "jacobian_pid_k0.1": "PID optimised",
-    "rl_critic": "PPO as printed, critic",
-    "rl_paper": "PPO, the paper's agent",
+    "rl_critic": "PPO as printed",
+    "rl_critic_nets": "PPO with a critic, our nets",
+    "rl_paper": "PPO by groups, the paper's observation",
     "rl": "PPO, our interface",
     "jacobian_pid_ff_integral": "strongest PID",
 }

@@ -1,20 +1,22 @@
 """Many seeds of one training, on this machine's cores or on a cluster."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from brokk_min._files import expect_same, write_json
+from brokk_min._files import digest, expect_same, write_json
 from brokk_min.actuator import ActuatorNet
+from brokk_min.evaluation.baselines import read_gains
 from brokk_min.evaluation.metrics import Mean, Table, evaluate, means, metadata
-from brokk_min.evaluation.sequences import evaluation_starts, task_sequences
+from brokk_min.evaluation.reproduce import mean_errors, robustness
+from brokk_min.evaluation.sequences import axis_sequences, evaluation_starts, task_sequences
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
-from brokk_min.learning.policy import load_policy
+from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.learning.recipes import Recipe
-from brokk_min.machine import Machine
+from brokk_min.machine import Controller, Machine
 
 
 def sweep(
@@ -25,12 +27,14 @@ def sweep(
     out: Path,
     starts: int,
     scheduler: str | None = None,
+    beside: Path | None = None,
 ) -> dict[str, dict[str, Mean]]:
     """Train and evaluate `seeds`; means over seeds with intervals, by sequence and figure.
 
     They and all runs go to `sweep.json` in `out`, policies and their curves to `seed_<n>.npz`. A
     seed counts once, with its mean over `starts` poses. `scheduler` is the address of a dask
-    scheduler, whose workers must have the folder (None: this machine).
+    scheduler, whose workers must have the folder (None: this machine). With a folder `beside` of
+    `reproduce`, or of the package, `robustness.json` has the mean errors on changed machines, too.
     """
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
@@ -39,6 +43,18 @@ def sweep(
     table = means([row | {"start": row["seed"]} for row in rows])["rl"]
     meta = metadata(machine, min(seeds)) | {"actuator": fingerprint(net)}
     write_json(out / "sweep.json", {"meta": meta, "table": table, "runs": rows})
+    if beside:
+        policies = {f"seed {seed}": out / f"seed_{seed}.npz" for seed in seeds}
+        others = {name: beside / file for name, file in POLICIES.items() if name != "rl"}
+        gains = beside / "gains.json"
+        score = partial(vary, machine, net, min(starts, 16))
+        every = policies | others | {"pids": gains}
+        jobs = {name: partial(score, name, file) for name, file in every.items()}
+        cases = side_by_side(jobs, None, scheduler)
+        meta |= {"starts": min(starts, 16), "seeds": [int(seed) for seed in seeds]}
+        meta["files"] = {file.name: digest(file) for file in every.values()}
+        result = {"meta": meta, "robustness": pool(cases, [*policies])}
+        write_json(out / "robustness.json", result)
     return table
 
 
@@ -59,3 +75,31 @@ def run_seed(
     else:
         policy = train_policy(machine, net, recipe, seed, file)
     return evaluate(machine, {"rl": policy}, commands, poses, 0)[0]
+
+
+def vary(
+    machine: Machine, net: ActuatorNet, starts: int, name: str, file: Path
+) -> dict[str, Table]:
+    """`reproduce.robustness` of the policy of a file, by its `name`, or of the PIDs of its gains.
+
+    Runs are those along x, y and z. A seed of a sweep is called "rl".
+    """
+    sequences = axis_sequences(machine)
+    poses = evaluation_starts(machine, starts, task_sequences(machine), 2)
+    if name == "pids":
+        controllers: dict[str, Controller] = {**read_gains(file, machine, net)}
+    else:
+        controllers = {"rl" if name.startswith("seed") else name: load_policy(file, machine)}
+    return robustness(machine, controllers, net, sequences, poses, 0)
+
+
+def pool(
+    cases: Mapping[str, Mapping[str, Table]], seeds: Sequence[str]
+) -> dict[str, dict[str, Mean]]:
+    """Mean errors by variation and controller: of "rl" over `seeds`, of others over starts."""
+    merged: dict[str, Table] = {}
+    for name, by_case in cases.items():
+        for case, runs in by_case.items():
+            one = [run | {"start": seeds.index(name)} if name in seeds else run for run in runs]
+            merged.setdefault(case, []).extend(one)
+    return mean_errors(merged)

@@ -12,7 +12,7 @@ from gymnasium.vector import VectorEnv
 from tqdm import tqdm
 
 from brokk_min import ppo
-from brokk_min._files import expect_same, expected, whole_file, write_csv
+from brokk_min._files import expect_same, expected, made_with, whole_file, write_csv
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
 from brokk_min.beyond.muon import muon
@@ -39,8 +39,8 @@ def train_policy(
     the result is the same as without the break. ValueError: a checkpoint of another training, or a
     loss that is not finite.
     """
-    about = {"contract": contract(machine), "actuator": fingerprint(net), "seed": seed}
-    about["recipe"] = asdict(recipe)
+    about: dict[str, Any] = {"contract": contract(machine, recipe.interface)}
+    about |= {"actuator": fingerprint(net), "seed": seed, "recipe": asdict(recipe)}
     torch.set_num_threads(1)  # several wait in vain on busy cores
     config, checkpoint = recipe.learner, Path(f"{out}.checkpoint")
     env, advantages, start = prepare(machine, net, recipe, seed)
@@ -60,7 +60,8 @@ def train_policy(
     size: dict[str, Any] = {"total": config.total_steps, "initial": start.global_step}
     with tqdm(desc="train", **size, unit="step", unit_scale=True, disable=None) as bar:
         agent = ppo.train(env, config, seed, advantages, on_update, start)
-    policy = Policy(machine, about, actor_weights(agent), net, recipe.interface)
+    training = about | {"made_with": made_with()}
+    policy = Policy(machine, training, actor_weights(agent), net, recipe.interface)
     save_policy(out, policy)
     checkpoint.unlink(missing_ok=True)
     return policy

@@ -39,7 +39,7 @@ def export_onnx(path: Path, policy: Policy) -> None:
     )
     assert program is not None
     mean, scale = INTERFACES[policy.interface].scale(policy.machine)
-    told = contract(policy.machine) | {"interface": policy.interface}
+    told = contract(policy.machine, policy.interface) | {"interface": policy.interface}
     told |= {"mean": mean.tolist(), "scale": scale.tolist(), "observation": OBSERVATION}
     told["action"] = "of pwm_limit / 127 of each driven joint, cut at 1 and rounded to counts"
     told["geometry_columns"] = ["a", "alpha", "d", "theta", "q_min", "q_max", "kind"]  # m and rad

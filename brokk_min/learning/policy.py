@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min._files import expect_same, expected, load_arrays, save_arrays
+from brokk_min import env
+from brokk_min._files import constants, expect_same, expected, load_arrays, save_arrays
 from brokk_min.actuator import ActuatorNet
-from brokk_min.beyond.interface import INTERFACE
-from brokk_min.env import PAPER
+from brokk_min.beyond import interface, valve_nets
 from brokk_min.identification.net_file import net_arrays, net_from_arrays, select_nets
 from brokk_min.machine import Array, Machine, Measured, require
 
-KIND = "policy 9"
-INTERFACES = {"paper": PAPER, "beyond": INTERFACE}  # by their names in files
-POLICIES = {  # files of `reproduce`: our agent, the paper's, and the paper's as printed
+KIND = "policy 10"
+INTERFACES = {"paper": env.PAPER, "beyond": interface.INTERFACE}  # by their names in files
+POLICIES = {  # files of `reproduce`: ours, with the paper's observation, and as printed
     "rl": "policy.npz",
     "rl_paper": "policy_paper.npz",
     "rl_critic": "policy_critic.npz",
@@ -50,15 +50,16 @@ class Policy:
 
     def __call__(self, measured: Measured, memory: Any) -> tuple[Array, Any]:
         """Commands u (num, n), and the memory of this tick."""
-        machine, interface = self.machine, INTERFACES[self.interface]
-        memory = interface.remember(machine, memory, measured)
-        action = self.act(interface.observe(machine, measured, memory))
-        return interface.command(machine, action, memory), memory
+        machine, its = self.machine, INTERFACES[self.interface]
+        memory = its.remember(machine, memory, measured)
+        action = self.act(its.observe(machine, measured, memory))
+        return its.command(machine, action, memory), memory
 
 
-def contract(machine: Machine) -> dict[str, Any]:
+def contract(machine: Machine, interface_name: str) -> dict[str, Any]:
     """What training and deployment must agree on; kept in the file and checked by `load_policy`."""
     joints = machine.joints
+    modules = (env,) if interface_name == "paper" else (env, interface, valve_nets)
     return {
         "machine": machine.name,
         "joints": list(machine.names),
@@ -69,6 +70,7 @@ def contract(machine: Machine) -> dict[str, Any]:
         "pwm_limit": machine.pwm_limit,
         "dead_zones": machine.dead_zones.tolist(),
         "geometry": [[j.a, j.alpha, j.d, j.theta, j.q_min, j.q_max, j.kind] for j in joints],
+        "constants": constants(*modules),
     }
 
 
@@ -77,7 +79,7 @@ def save_policy(path: Path, policy: Policy) -> None:
     net_header, arrays = net_arrays(policy.net)
     header = {
         "interface": policy.interface,
-        "contract": contract(policy.machine),
+        "contract": contract(policy.machine, policy.interface),
         "training": dict(policy.training),
         "net": net_header,
     }
@@ -90,7 +92,7 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     """Read a policy for `machine`; ValueError: its first difference from the machine."""
     header, arrays = load_arrays(path, KIND)
     with expected(path, "a complete policy"):
-        expect_same(path, header["contract"], contract(machine))
+        expect_same(path, header["contract"], contract(machine, header["interface"]))
         mean, scale = INTERFACES[header["interface"]].scale(machine)
         fits = np.array_equal(arrays["mean"], mean) and np.array_equal(arrays["scale"], scale)
         require(fits, str(path), f"the machine's scale of {header['interface']}", "another")

@@ -34,7 +34,7 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
         assert errors[-1][0] == pytest.approx(0.1, rel=1e-6)  # the policy stands still
         printed = capsys.readouterr().out
         assert "means over 1 sequences from 1 starts" in printed
-        assert f"{'strongest PID':38}{'closed':>15}{errors[-1][-1]:15.4g}" in printed
+        assert f"{'strongest PID':56}{'closed':>15}{errors[-1][-1]:15.4g}" in printed
     assert len({*errors}) == 3
     assert evaluate(folder, f"--json {out}") == 2  # it is there
 

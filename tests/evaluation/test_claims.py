@@ -11,6 +11,7 @@ from brokk_min.evaluation.rollout import TITLES
 
 HIGH, LOW, RAW = "jacobian_pid_k0.1", "pid_by_hand", "pid_by_hand_raw"
 PPO = "rl_paper"
+POLICIES = (PPO, "rl_critic", "rl_critic_nets")
 TIME = 0.05 * (np.arange(60) - 29.5)
 TRUE, FALSE, UNKNOWN = "holds here", "does not hold here", "was not measured"
 
@@ -18,7 +19,7 @@ TRUE, FALSE, UNKNOWN = "holds here", "does not hold here", "was not measured"
 def runs_with(error, drift):
     """Six starts with figures around values by controller, or by sequence and controller."""
     rows = []
-    for sequence, controller, i in product("xyz", (PPO, "rl_critic", HIGH, LOW, RAW), range(6)):
+    for sequence, controller, i in product("xyz", (*POLICIES, HIGH, LOW, RAW), range(6)):
         row = {"controller": controller, "sequence": sequence, "start": i}
         for key, of in (("velocity_error_mean", error), ("off_axis_drift_max", drift)):
             value = of.get((sequence, controller), of.get(controller, 0.0))
@@ -80,7 +81,7 @@ def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expe
     errors = {("x", PPO): x, ("z", PPO): z, PPO: 0.01, HIGH: 0.02, LOW: 0.05, RAW: 0.06}
     drifts = {PPO: drift, ("x", HIGH): 0.03, HIGH: 0.2, LOW: 0.4, RAW: 0.4}
     still, fails, *result = claims.task_claims(runs_with(errors, drifts))
-    assert [verdict(still, name) for name in (PPO, "rl_critic")] == [FALSE, TRUE]
+    assert [verdict(still, name) for name in POLICIES] == [FALSE, TRUE, TRUE]
     assert [verdict(fails, pid) for pid in (RAW, LOW, HIGH)] == [TRUE, TRUE, FALSE]
     assert still["numbers"][TITLES[PPO]]["drift"]["mean"] == pytest.approx(drift + 0.001)
     # tracking, along z, all in all
@@ -88,3 +89,15 @@ def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expe
     assert {verdict(claim, PPO, LOW) for claim in result} == {TRUE}
     numbers = result[1]["numbers"][f"{TITLES[PPO]} against {TITLES[HIGH]}"]
     assert numbers["drift along z"]["mean"] == pytest.approx(drift - 0.2)
+
+
+def test_verdict_rows__compare_with_the_optimised_pid_alone():
+    """Of the policies that have runs; each of the paper's sentences on motion is there."""
+    runs = runs_with({PPO: 0.01, HIGH: 0.02}, {})
+    runs = [run for run in runs if not run["controller"].startswith("rl_critic")]
+    rows = claims.verdict_rows(claims.task_claims(runs))
+    against = f"{TITLES[PPO]} against {TITLES[HIGH]}"
+    judged = [TITLES[PPO], *(TITLES[pid] for pid in claims.PIDS), against, against, against]
+    assert [row[2] for row in rows] == judged
+    words = claims.TEXTS["outperforms"]["paper"]
+    assert rows[-1] == ["Sec. 5", words, against, "error along all -0.0100", TRUE]

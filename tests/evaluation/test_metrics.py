@@ -41,6 +41,8 @@ def test_metrics__by_hand():
     rows = m.metrics(BROKK_170, trace, goals, np.zeros((2, 3)))
     rewards = (1 / 1.1 + 1 + 2 / 1.2) / 4, 1
     np.testing.assert_allclose(rows.pop("reward_mean"), rewards)
+    np.testing.assert_allclose(rows.pop("velocity_error_transient"), [0.125, np.nan])
+    np.testing.assert_allclose(rows.pop("velocity_error_steady"), [np.nan, 0])
     expected = {
         "velocity_error_mean": (0.1 + 0.0 + 0.2 + 0.2) / 4,
         "velocity_rmse": np.sqrt((0.01 + 0.04 + 0.04) / 4),
@@ -52,6 +54,33 @@ def test_metrics__by_hand():
     assert rows.keys() == expected.keys()
     for name, value in expected.items():
         np.testing.assert_allclose(rows[name], [value, 0], atol=1e-12, err_msg=name)
+
+
+def test_after_a_change__is_the_first_second_after_a_jump():
+    """At 20 Hz; 14 mm/s in a tick is no jump, 16 mm/s is one."""
+    goals = np.zeros((60, 2, 3))
+    goals[5:, 0], goals[45:, 0] = [0.016, 0.0, 0.0], [0.016, 0.0, 0.014]
+    goals[:, 1, 1] = 0.014 * np.arange(1, 61)
+    np.testing.assert_array_equal(
+        np.flatnonzero(m.after_a_change(BROKK_170, goals)[:, 0]), range(5, 25)
+    )
+    assert not m.after_a_change(BROKK_170, goals)[:, 1].any()
+
+
+def test_compare__is_paired_by_hand():
+    """Differences of -1, -2 and 3 from a mean of 10; along y there is no figure."""
+    figures = {"a": [9.0, 7.0, 14.0], "b": [10.0, 9.0, 11.0]}
+    runs = [
+        {"controller": c, "sequence": s, "start": i, "error": x if s == "x" else None}
+        for c, row in figures.items()
+        for s in "xy"
+        for i, x in enumerate(row)
+    ]
+    result = m.compare(runs, "a", "b", "error")
+    half = 10 * 4.302653 * np.sqrt(7 / 3)  # Student's t of 2; the variance is 7
+    expected = {"mean": 0, "low": -half, "high": half, "won": 2, "runs": 3}
+    assert result["x"] == result["all"] == pytest.approx(expected, rel=1e-5, abs=1e-9)
+    assert result["y"] == {"mean": None, "low": None, "high": None, "won": 0, "runs": 0}
 
 
 STARTS = np.array([BROKK_170.q_start, [1.0, 0.5, 0.9, 1.5, 1.0]])
@@ -72,7 +101,7 @@ def test_evaluate__gives_rows_in_order_with_their_figures():
     goals = sequences[1].for_starts(BROKK_170, STARTS)
     expected = m.metrics(BROKK_170, traces["pid", "y"], goals, p_start)
     for key, values in expected.items():
-        assert [row[key] for row in rows[2:4]] == values.tolist(), key
+        assert [row[key] for row in rows[2:4]] == [None if x != x else x for x in values], key
     pid, idle = (m.means(rows)[c]["all"]["velocity_error_mean"]["mean"] for c in controllers)
     assert pid < idle
 

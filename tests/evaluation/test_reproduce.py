@@ -10,15 +10,17 @@ import pytest
 from helpers_cli import run
 from helpers_machines import POSE, Idle, coarse, obedient_net, one_by_one, pids, short_axes
 
+from brokk_min._files import digest
 from brokk_min.actuator import cylinder_speeds, hydraulics_of
 from brokk_min.evaluation import adaptive, baselines, metrics, report, reproduce
+from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import read_starts, task_sequences
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import fingerprint, load_net
-from brokk_min.learning.policy import POLICIES, load_policy
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
 
 COARSE = coarse(replace(BROKK_170, rate=10.0), 0.025)  # four Euler steps a tick: fast
@@ -73,13 +75,17 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
 def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
     log = read_log(folder / "log.npz", COARSE)
     assert log.joints == load_net(folder / "net.npz").joints == BROKK_170.names
-    policies = {name: load_policy(folder / file, COARSE) for name, file in POLICIES.items()}
-    interfaces = {"rl": "beyond", "rl_paper": "paper", "rl_critic": "paper"}
+    policies = {
+        name: load_policy(folder / file, COARSE) for name, file in reproduce.TRAINED.items()
+    }
+    interfaces = {name: "beyond" if name == "rl" else "paper" for name in policies}
     assert {name: policy.interface for name, policy in policies.items()} == interfaces
     learned_on = {name: fingerprint(policy.net) for name, policy in policies.items()}
     ours, printed = (load_net(folder / f"{name}.npz", COARSE) for name in ("net", "net_paper"))
-    assert learned_on["rl"] == learned_on["rl_paper"] == fingerprint(ours)
-    assert learned_on["rl_critic"] == fingerprint(printed) != fingerprint(ours)
+    assert learned_on.pop("rl_critic") == fingerprint(printed) != fingerprint(ours)
+    assert {*learned_on.values()} == {fingerprint(ours)}
+    scored = {file: digest(folder / file) for file in (*reproduce.TRAINED.values(), "gains.json")}
+    assert results["meta"]["files"] == scored
     np.testing.assert_array_equal(read_starts(folder / "starts.csv", COARSE), results["starts"])
     assert baselines.read_gains(folder / "gains.json", COARSE, policies["rl"].net)
     assert results["meta"]["seed"] == 3 and results["meta"]["machine"] == "brokk170"
@@ -95,6 +101,12 @@ def test_reproduce__results_hold_every_run_and_a_verdict_on_each_sentence(folder
     mean = results["task_space"]["means"]["rl"]["all"][ERROR]["mean"]
     assert mean == pytest.approx(np.mean(of_rl.pop("all")))
     assert results["table"]["rl"][ERROR]["mean"] == pytest.approx(np.mean([*of_rl.values()]))
+    pairs = {(pair["policy"], pair["pid"]): pair["figures"] for pair in results["pairs"]}
+    assert list(pairs) == list(reproduce.PAIRS)
+    assert list(pairs["rl", STRONGEST][ERROR]) == [*names, "all"]
+    assert pairs["rl", STRONGEST][ERROR]["z"] == metrics.compare(runs, "rl", STRONGEST, ERROR)["z"]
+    table = json.loads((folder / "table.json").read_text())
+    assert table == {key: results[key] for key in ("meta", "table", "pairs", "claims")}
     sentences = [claim["paper"] for claim in results["claims"]]
     assert sentences == [text["paper"] for text in TEXTS.values()]
     page = (folder / "report.html").read_text()
@@ -118,10 +130,14 @@ def test_robustness__has_a_row_for_each_variation_and_controller():
     net = obedient_net(BROKK_170)
     pid = pids(BROKK_170, net)["jacobian_pid_ff_integral"]
     task = {"idle": Idle(), "pid": pid}, short_axes(20, 2)[2:], np.tile(POSE, (2, 1)), 0
-    table = reproduce.robustness(BROKK_170, task[0], net, *task[1:])
+    table = reproduce.mean_errors(reproduce.robustness(BROKK_170, task[0], net, *task[1:]))
     kinds = [f"{name}{start}" for start in ("", "+cold", "+warm") for name in ("idle", "pid")]
     assert sorted(table["nominal"]) == sorted(kinds)
-    assert list(table) == [*reproduce.variations(BROKK_170), "goals +50 %"]
+    further = ["goals +50 %", "no sensor noise", "twice the sensor noise"]
+    assert list(table) == [*reproduce.variations(BROKK_170), *further]
+    for name, noise in zip(further[1:], (0.0, 0.1), strict=True):
+        noisy, _ = metrics.evaluate(BROKK_170, *task, noise=noise)
+        assert table[name]["pid"] == metrics.means(noisy)["pid"]["all"][ERROR]
     runs, _ = metrics.evaluate(reproduce.variations(BROKK_170)["delay +50 ms"], *task)
     error = metrics.by_start(runs, "pid", "all", ERROR)
     assert table["delay +50 ms"]["pid"] == metrics.mean_interval(error)

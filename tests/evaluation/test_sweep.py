@@ -5,12 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_bus import random_policy
 from helpers_cli import run
-from helpers_machines import POSE, one_by_one, short_axes, small_net
+from helpers_machines import POSE, one_by_one, pids, short_axes, small_net
 
-from brokk_min.evaluation import metrics, sweep
+from brokk_min._files import digest
+from brokk_min.evaluation import adaptive, metrics, reproduce, sweep
+from brokk_min.evaluation.baselines import gains_metadata, write_gains
 from brokk_min.identification.net_file import save_net
-from brokk_min.learning.policy import load_policy
+from brokk_min.learning.policy import POLICIES, load_policy, save_policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170
 
@@ -22,6 +25,44 @@ TINY = {"num_envs": 4, "horizon": 4, "epochs": 1, "minibatch_size": 16, "total_s
 RECIPE = replace(PAPER, learner=replace(PAPER.learner, **TINY))
 OPTIONS = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in TINY.items())
 ERROR = "velocity_error_mean"
+
+
+def test_robustness__is_over_seeds_for_them_and_over_starts_for_the_others(tmp_path, monkeypatch):
+    """By its command; each file is named by its fingerprint."""
+    monkeypatch.setattr(sweep, "side_by_side", one_by_one)
+    monkeypatch.setattr(sweep, "evaluation_starts", lambda machine, num, *_: POSES[:num])
+    for name in ("task_sequences", "axis_sequences"):
+        monkeypatch.setattr(sweep, name, lambda machine: SEQUENCES)
+    monkeypatch.setattr(reproduce, "variations", lambda machine: {"nominal": machine})
+    monkeypatch.setattr(adaptive, "DRIVES", 2)
+    net, out, beside = (tmp_path / name for name in ("net.npz", "out", "beside"))
+    save_net(net, NET)
+    beside.mkdir()
+    for name in ("rl_paper", "rl_critic"):
+        save_policy(beside / POLICIES[name], random_policy("paper"))
+    given = pids(BROKK_170, NET)
+    write_gains(beside / "gains.json", given, gains_metadata(BROKK_170, NET))
+    command = f"sweep --actuator {net} --out {out} --seeds 2 --num-starts 2 --paper --critic"
+    assert run(f"{command} {OPTIONS} --robustness {beside}") == 0
+    written = json.loads((out / "robustness.json").read_text())
+    cases, files = written["robustness"], written["meta"]["files"]
+    names = ["seed_0.npz", "seed_1.npz", "policy_paper.npz", "policy_critic.npz", "gains.json"]
+    assert list(files) == names and files["seed_1.npz"] == digest(out / "seed_1.npz")
+    plain = ["rl", "rl_paper", "rl_critic", *given]
+    assert sorted(cases["nominal"]) == sorted(
+        f"{n}{s}" for n in plain for s in ("", "+cold", "+warm")
+    )
+    means = [
+        metrics.by_start(
+            metrics.evaluate(BROKK_170, {"rl": one}, SEQUENCES, POSES, 0)[0], "rl", "all", ERROR
+        )
+        for one in (load_policy(out / f"seed_{seed}.npz", BROKK_170) for seed in (0, 1))
+    ]
+    assert cases["nominal"]["rl"] == pytest.approx(metrics.mean_interval(np.mean(means, axis=1)))
+    pid = given["pid_by_hand"]
+    runs, _ = metrics.evaluate(BROKK_170, {"pid": pid}, SEQUENCES, POSES, 0, noise=0.1)
+    expected = metrics.mean_interval(metrics.by_start(runs, "pid", "all", ERROR))
+    assert cases["twice the sensor noise"]["pid_by_hand"] == pytest.approx(expected)
 
 
 def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):

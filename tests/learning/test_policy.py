@@ -1,15 +1,18 @@
 """The policy: by hand, against torch, refusals of its file."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from helpers_bus import random_policy
-from helpers_machines import POSE
+from helpers_machines import POSE, pids
 
 from brokk_min import env
 from brokk_min._files import SHIPPED
+from brokk_min.beyond import interface
+from brokk_min.evaluation.baselines import gains_metadata, read_gains, write_gains
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import actor_weights
 from brokk_min.learning.policy import POLICIES, load_policy, save_policy
@@ -56,6 +59,21 @@ def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message)
     save_policy(tmp_path / "p.npz", random_policy("paper"))
     with pytest.raises(ValueError, match=message):
         load_policy(tmp_path / "p.npz", replace(BROKK_170, q_start=(), **change))
+
+
+def test_files__made_with_another_constant_are_refused_by_its_name(tmp_path, monkeypatch):
+    """A policy of the paper's interface has none of ours."""
+    files = {kind: tmp_path / f"{kind}.npz" for kind in ("paper", "beyond")}
+    for kind, file in files.items():
+        save_policy(file, random_policy(kind))
+    net, gains = load_policy(files["beyond"], BROKK_170).net, tmp_path / "gains.json"
+    write_gains(gains, pids(BROKK_170, net), gains_metadata(BROKK_170, net))
+    monkeypatch.setattr(interface, "ALONG", 0.07)
+    for read in (load_policy, partial(read_gains, net=net)):
+        file = files["beyond"] if read is load_policy else gains
+        with pytest.raises(ValueError, match=r"interface: ALONG: expected 0\.07, got 0\.02$"):
+            read(file, BROKK_170)
+    assert load_policy(files["paper"], BROKK_170).interface == "paper"
 
 
 @pytest.mark.parametrize("file", POLICIES.values())

@@ -5,6 +5,7 @@
 
 import doctest
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -13,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from brokk_min.__main__ import COMMANDS, main
-from brokk_min._files import SHIPPED
-from brokk_min.evaluation.report import BOUND
+from brokk_min._files import SHIPPED, digest
 from brokk_min.machine import BROKK_170
 
 ROOT = Path(__file__).parents[2]
@@ -42,19 +42,42 @@ def counted(text: str) -> str:
     return ROW.sub(row, text)
 
 
-RESULT = re.compile(r"^\| .*?(PID|PPO|bound).*? \| ([\d.]+) \| ?([\d.]*) \| ?(.*) ?\|$", re.M)
+RESULT = re.compile(r"^\| .*?(PID|PPO).*? \| ([\d.]+) \| ?([\d.]*) \| ?(.*) ?\|$", re.M)
 SHOWN = ("pid_by_hand", "jacobian_pid_k0.1", "rl_paper", "rl", "jacobian_pid_ff_integral")
 
 
 def test_readme__results_are_those_of_the_shipped_files() -> None:
-    """`reproduce` writes table.json; the bound is of `benchmarks.perfect_model`."""
+    """`reproduce` writes table.json."""
     table = json.loads((SHIPPED / "brokk170" / "table.json").read_text())["table"]
     rows = RESULT.findall(README.read_text())
-    assert len(rows) == 6
-    for name, (_, error, drift, _) in zip(SHOWN, rows, strict=False):
+    assert len(rows) == len(SHOWN)
+    for name, (_, error, drift, _) in zip(SHOWN, rows, strict=True):
         assert f"{table[name]['velocity_error_mean']['mean']:.4f}" == error
         assert f"{table[name]['off_axis_drift_max']['mean']:.3f}" == drift
-    assert rows[5][:2] == ("bound", f"{BOUND:.4f}")
+
+
+@pytest.mark.parametrize("table", sorted(SHIPPED.rglob("*.json")), ids=lambda path: path.name)
+def test_shipped_tables__name_the_files_beside_them(table: Path) -> None:
+    """Seeds of a sweep are not shipped, but for the one that is the policy."""
+    meta = json.loads(table.read_text())["meta"]
+    beside = {name: digest(table.parent / name) for name in os.listdir(table.parent)}
+    for name, fingerprint in meta.get("files", {}).items():
+        assert name.startswith("seed_") or beside.get(name) == fingerprint, name
+
+
+CHANGED = re.compile(r"^\| (.+?) \| (\d\.\d{4}[^|]*(?: \| \d\.\d{4}[^|]*)*) \|$", re.M)
+
+
+def test_readme__errors_on_changed_machines_are_those_of_the_sweep() -> None:
+    """Columns: our agent, the strongest PID, with the paper's observation, the optimised PID."""
+    file = SHIPPED / "brokk170" / "robustness.json"
+    cases = json.loads(file.read_text())["robustness"] if file.exists() else {}
+    columns = ("rl", "jacobian_pid_ff_integral", "rl_paper", "jacobian_pid_k0.1")
+    rows = [row for row in CHANGED.findall(README.read_text()) if row[0] in cases]
+    assert bool(rows) == file.exists()
+    for name, cells in rows:
+        means = [f"{cases[name][controller]['mean']:.4f}" for controller in columns]
+        assert cells.split(" | ") == means, name
 
 
 def test_readme__lists_the_wings() -> None:

@@ -4,6 +4,7 @@
 """
 
 import ast
+import json
 import re
 import runpy
 from collections.abc import Iterator
@@ -11,6 +12,9 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+
+from brokk_min._files import SHIPPED
+from brokk_min.evaluation.claims import verdict_rows
 
 ROOT = Path(__file__).parents[2]
 MAKER = runpy.run_path(str(ROOT / "docs" / "annotated.py"))
@@ -47,7 +51,7 @@ def labels(cell: str) -> list[str]:
 
 NAMED = table("Equations, tables, figures") + table("Sections")
 CONSTANT = table("Constants")
-ROWS = [row[-3:] for row in NAMED + CONSTANT]  # code, test, status
+ROWS = [row[-4:] for row in NAMED + CONSTANT]  # code, test, status, remark
 LABELS = sorted(set(labels(PAPER)))
 
 
@@ -60,24 +64,22 @@ def test_rows__are_all_that_the_paper_numbers_in_its_order() -> None:
 
 
 def test_rows__have_code_and_one_or_two_tests_unless_not_yet_there() -> None:
-    for code, test, status in ROWS:
-        kind = re.match(
-            r"printed|(corrected|changed), [DS]\d|assumed.*, A\d|not compared|not yet", status
-        )
-        assert kind, status
-        assert bool(labels(code)) == bool(labels(test)) == (kind[0][:3] != "not"), (code, status)
+    needed = {"printed": "", "corrected": r"[DS]\d", "changed": r"D\d", "assumed": r"A\d"}
+    for code, test, status, remark in ROWS:
+        assert re.search((needed | {"not compared": "."})[status], remark), (status, remark)
+        assert bool(labels(code)) == bool(labels(test)) == (status in needed), (code, status)
         assert len(labels(test)) <= 2, test
 
 
 def test_deviations__are_named_by_rows_and_explained() -> None:
     stories = (ROOT / "docs" / "deviations.md").read_text()
-    statuses = " ".join(status for *_, status in ROWS)
+    remarks = " ".join(remark for *_, remark in ROWS)
     for heading, letter in (("Deviations", "D"), ("Assumptions", "A"), ("Slips of the paper", "S")):
         listed = [row[0] for row in table(heading)]
         assert set(re.findall(rf"\b{letter}\d+\b", PAPER)) == set(listed)
         if letter != "S":
             assert re.findall(rf"^### ({letter}\d+)\.", stories, re.M) == listed
-    assert {row[0] for row in table("Deviations")} == set(re.findall(r"\bD\d+\b", statuses))
+    assert {row[0] for row in table("Deviations")} == set(re.findall(r"\bD\d+\b", remarks))
 
 
 # --- places ---------------------------------------------------------------------------------------
@@ -132,8 +134,8 @@ def documented() -> Iterator[tuple[str, str]]:
 def test_docstrings_and_rows__name_each_other() -> None:
     """A tag `Fig. 6` stands for all its panels, and one of a module's tags for its definitions."""
     tags = set(documented())
-    named = {(s.partition(".")[0], row[0]) for row in NAMED for s in labels(row[-3])}
-    constants = {(s.partition(".")[0], row[1]) for row in CONSTANT for s in labels(row[-3])}
+    named = {(s.partition(".")[0], row[0]) for row in NAMED for s in labels(row[-4])}
+    constants = {(s.partition(".")[0], row[1]) for row in CONSTANT for s in labels(row[-4])}
     for module, tag in tags:
         rows = {row for other, row in named | constants if other == module}
         assert any(row.startswith(tag) for row in rows), f"no row of {tag} has code of {module}"
@@ -180,10 +182,29 @@ def test_tests__use_the_code_of_their_row(code: str, test: str) -> None:
     assert not missing, f"{test} do not use {missing}"
 
 
+VERDICTS = "<!-- verdicts: written by `python tests/paper/test_paper.py` -->\n"
+
+
+def with_verdicts(text: str) -> str:
+    """The page with the verdicts of the shipped table."""
+    shipped = json.loads((SHIPPED / "brokk170" / "table.json").read_text())
+    rows = [["where", "the paper writes", "of", "measured", "the sentence"], ["---"] * 5]
+    rows += verdict_rows(shipped["claims"])
+    lines = [f"| {' | '.join(row)} |\n" for row in rows]
+    before, _, after = text.partition(VERDICTS)
+    end = "<!-- end of verdicts -->"
+    return before + VERDICTS + "".join(lines) + end + after.partition(end)[2]
+
+
+def test_verdicts__are_those_of_the_shipped_table() -> None:
+    assert with_verdicts(PAPER) == PAPER, "run `python tests/paper/test_paper.py`"
+
+
 def write() -> None:
-    """Write the links at the end of PAPER.md; ValueError: the first that is no longer there."""
+    """Write links and verdicts of PAPER.md; ValueError: the first that is no longer there."""
     lines = [link(label) for label in LABELS]
-    PAGE.write_text(PAGE.read_text().removesuffix(LINKS) + "\n" + "\n".join(lines) + "\n")
+    text = PAGE.read_text().removesuffix(LINKS) + "\n" + "\n".join(lines) + "\n"
+    PAGE.write_text(with_verdicts(text))
 
 
 if __name__ == "__main__":
