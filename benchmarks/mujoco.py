@@ -5,8 +5,8 @@
 It records the machine of `examples/mujoco_brokk.py`, fits nets to the recordings, trains policies
 on the nets, and tunes the PIDs on the machine itself. Then it scores all of them on the nets, on
 the machine, and on the machine with a load, on a slope and with a weaker pump, of which neither
-nets nor gains know. What the folder holds already is not made again. `mujoco.md` in the folder is
-the page, `mujoco.json` has all runs.
+nets nor gains know, plain and adaptive (`beyond.adaptation`). What the folder holds already is not
+made again. `mujoco.md` in the folder is the page, `mujoco.json` has all runs.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,9 +22,9 @@ import benchmarks  # noqa: F401, before NumPy computes: one thread
 from brokk_min._files import write_json
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.rich_excitation import RICH
-from brokk_min.evaluation import baselines, metrics, sequences
+from brokk_min.evaluation import adaptive, baselines, metrics, sequences
 from brokk_min.evaluation.reproduce import QUICK, Budget, Chain, fit_net, train_one
-from brokk_min.evaluation.rollout import TITLES
+from brokk_min.evaluation.rollout import title
 from brokk_min.fit import Log, collect
 from brokk_min.identification import inspection, logs, validation
 from brokk_min.identification.net_file import load_net, select_nets
@@ -110,10 +110,22 @@ def score(options: Options, net: ActuatorNet, rivals: Mapping[str, Any]) -> dict
     if options.quick:
         commands = [s._replace(goals=s.goals[: round(8.0 * M.rate)]) for s in commands[:3]]
         starts = starts[:4]
-    of_each = partial(metrics.evaluate, M, rivals, commands, starts, options.seed)
-    plants = {"nets": select_nets(M, net), **PLANTS}
-    done = side_by_side({name: partial(of_each, plant=plant) for name, plant in plants.items()})
-    return {name: runs for name, (runs, _) in done.items()}
+    driven, motions = (
+        select_nets(M, net),
+        adaptive.warm_up_motions(M, 2.0 if options.quick else 20.0),
+    )
+    learning = {
+        name: one for name, one in rivals.items() if name in (*POLICIES, baselines.STRONGEST)
+    }
+
+    def of_each(plant: Any) -> list[dict[str, Any]]:
+        rows = len(commands) * len(starts)
+        both = adaptive.cold_and_warm(learning, driven, M, M, rows, motions, plant)
+        runs, _ = metrics.evaluate(M, {**rivals, **both}, commands, starts, options.seed, plant)
+        return runs
+
+    plants = {"nets": driven, **PLANTS}
+    return side_by_side({name: partial(of_each, plant) for name, plant in plants.items()})
 
 
 def table(runs: Mapping[str, Any]) -> str:
@@ -127,7 +139,7 @@ def table(runs: Mapping[str, Any]) -> str:
         drifts = [figure["off_axis_drift_max"]["mean"] for figure in figures]
         cells = [f"{error:.4f}, {drift:.3f}" for error, drift in zip(errors, drifts, strict=True)]
         cells.append(f"{errors[1] / errors[0]:.2f}")
-        lines.append(f"| {TITLES[name]} | " + " | ".join(cells) + " |")
+        lines.append(f"| {title(name)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
