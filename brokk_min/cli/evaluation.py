@@ -111,5 +111,5 @@ class Reproduce(Command):
         file = self.out / "results.json"
         check(self.force or not file.exists(), str(file), "no file (or --force)", "one")
         results = reproduce(machine, self.out, budget, self.seed)
-        print(table(results["task_space"]["runs"]))
+        print(table(results["task_space"]["runs"]), *results["trainings"], sep="\n")
         print(self.out / "report.html", file, sep="\n")

@@ -20,13 +20,14 @@ from brokk_min.evaluation import (
     report,
     sequences,
 )
+from brokk_min.evaluation.rollout import title
 from brokk_min.fit import SINE, Excitation, Log, collect
 from brokk_min.identification import fitting, logs
 from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, Policy
-from brokk_min.learning.recipes import find_recipe
+from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.machine import Array, Machine
 
 # beyond the chain's: sixth in error of the seeds 0 to 9, of a critic third of 0 to 3
@@ -45,7 +46,7 @@ class Budget:
     short_s: float = 26.0  # s, longest run for robustness
 
 
-QUICK = Budget(0.1, 700, 100_000, (4, 4, 3.0), 4, 3.0)
+QUICK = Budget(0.3, 2000, 400_000, (4, 8, 10.0), 4, 3.0)
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,14 @@ def fit_net(chain: Chain, name: str, log: Log, recipe: Mapping[str, Any]) -> Act
     return net
 
 
+def recipe_of(name: str) -> Recipe:
+    """The recipe of one of `POLICIES`."""
+    return find_recipe(paper=name != "rl", critic=name == "rl_critic")
+
+
 def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     """One of `POLICIES`, by its own recipe."""
-    recipe = find_recipe(paper=name != "rl", critic=name == "rl_critic")
+    recipe = recipe_of(name)
     steps = chain.budget.train_steps or recipe.learner.total_steps
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=steps))
     driven, seed = select_nets(chain.machine, net), chain.seed + MEDIAN_SEEDS[name]
@@ -135,10 +141,28 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
         "table": {name: of["all"] for name, of in along.items()},
         "task_space": {"runs": runs, "means": metrics.means(runs)},
         "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
+        "trainings": trainings(budget, runs),
         "robustness": robustness(machine, controllers, net, short, starts[:16], seed),
         "starts": starts.tolist(),
     }
     return results, (tests, gap, traces)
+
+
+def trainings(budget: Budget, runs: Sequence[metrics.Run]) -> list[str]:
+    """What a reader must know of learners that did not learn to the end: a line for each."""
+
+    def error(name: str) -> float:
+        return float(metrics.by_start(runs, name, "all", "velocity_error_mean").mean())
+
+    lines = []
+    for name in POLICIES:
+        whole = recipe_of(name).learner.total_steps
+        if steps := budget.train_steps:
+            better = error(name) < error(baselines.BY_HAND)
+            said = "better" if better else "needs more to be better"
+            line = f"{title(name)}: after {steps:,} of {whole:,} steps {said} than the PID by hand"
+            lines.append(line)
+    return lines
 
 
 def variations(machine: Machine) -> dict[str, Machine]:

@@ -10,7 +10,6 @@ from helpers_cli import run
 from helpers_machines import short_axes, small_net
 
 from brokk_min._files import SHIPPED
-from brokk_min.cli.training import Train
 from brokk_min.evaluation import progress, sequences
 from brokk_min.evaluation.rollout import title
 from brokk_min.identification.net_file import fingerprint, save_net
@@ -57,11 +56,6 @@ def test_train__has_its_settings_from_the_line(
     recipe = policy.training["recipe"]
     assert recipe["task"]["hold_max_s"] == 9 and policy.training["seed"] == 4
     assert learner.items() <= recipe["learner"].items()
-
-
-def test_train__is_short_for_our_agent_alone():
-    steps = {line: Train.defaults(line.split()).learner.total_steps for line in ("", "--paper")}
-    assert steps == {"": 400_000, "--paper": 75_000_000}
 
 
 def test_train__goes_on_only_if_it_is_told_to(tmp_path, capsys):
