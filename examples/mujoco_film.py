@@ -2,12 +2,13 @@
 
     python -m examples.mujoco_film --out film.gif
 
-Grey is the path that is wanted, blue the one that the tool has taken. The numbers are the mean
-velocity error since the start, and the largest distance from the path. MuJoCo's renderer needs
+Grey is the path that is wanted, blue the one that the tool has taken. The chart has the velocity
+error |v_goal - v_tool| since the start, and the number its mean so far. MuJoCo's renderer needs
 OpenGL; on a computer without a screen set MUJOCO_GL=egl.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,9 @@ from brokk_min.machine import Array
 from brokk_min.settings import TaskConfig
 from examples.mujoco_brokk import PLANT, build
 
-SIZE = (440, 400)  # px, of each half
+SIZE = (440, 330)  # px, of each half
+CHART = 70  # px, its height below that
+HIGHEST = 0.15  # m/s, in the chart
 GREY, BLUE = (0.25, 0.25, 0.28, 1.0), (0.0, 0.45, 0.7, 1.0)
 FONT = ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", 17)
 GAINS = SHIPPED / M.name / "gains.json"
@@ -66,7 +69,7 @@ def renderer() -> tuple[Any, Any, Any]:
 
 def draw_path(scene: Any, points: Array, width: float, colour: tuple[float, ...]) -> None:
     """Add a line through points (T, 3) [m] to MuJoCo's scene."""
-    for start, end in zip(points[:-1], points[1:], strict=True):
+    for start, end in pairwise(points):
         geom = scene.geoms[scene.ngeom]
         zeros, capsule = np.zeros(3), mujoco.mjtGeom.mjGEOM_CAPSULE
         mujoco.mjv_initGeom(geom, capsule, zeros, zeros, np.zeros(9), np.array(colour, np.float32))
@@ -78,7 +81,7 @@ def main(options: Options) -> None:
     """Drive, draw and write."""
     eye, model, data = renderer()
     camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance = (-0.2, 1.7, 0.95), 5.0
+    camera.lookat[:], camera.distance = (-0.2, 1.65, 1.05), 5.0
     camera.azimuth, camera.elevation = 165.0, -12.0
     policy = load_policy(options.policy, M)
     pid = load_pids(M, GAINS, policy.net)[BY_HAND]
@@ -100,13 +103,16 @@ def main(options: Options) -> None:
             taken = trace.p_tool[: k + 1, 0]  # (k + 1, 3)
             draw_path(eye.scene, wanted[::step], 0.012, GREY)
             draw_path(eye.scene, taken[::step], 0.02, BLUE)
-            half = Image.fromarray(eye.render())
-            error = np.linalg.norm(goals - trace.v_tool, axis=-1)[: k + 1].mean()
-            off = np.linalg.norm(taken[:, None] - wanted, axis=-1).min(axis=1).max()
+            half = Image.new("RGB", (SIZE[0], SIZE[1] + CHART), "white")
+            half.paste(Image.fromarray(eye.render()))
+            error = np.linalg.norm(goals - trace.v_tool, axis=-1)[: k + 1, 0]
+            x = np.arange(k + 1) * (SIZE[0] - 24) / len(goals) + 12
+            y = SIZE[1] + CHART * (1 - np.minimum(error / HIGHEST, 1))
             pen = ImageDraw.Draw(half)
+            outline = np.column_stack([[*x, x[-1], x[0]], [*y, *2 * [SIZE[1] + CHART]]])
+            pen.polygon(outline.ravel().tolist(), "firebrick")
             pen.text((12, 10), name, "black", FONT)
-            pen.text((12, 34), f"mean error {1e3 * error:.0f} mm/s", "black", FONT)
-            pen.text((12, 56), f"off the path {1e3 * off:.0f} mm", "black", FONT)
+            pen.text((12, 34), f"velocity error {1e3 * error.mean():.0f} mm/s", "black", FONT)
             halves.append(np.array(half))
         pair = Image.fromarray(np.hstack(halves))
         pictures.append(pair.quantize(96, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
