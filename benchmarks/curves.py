@@ -1,95 +1,93 @@
-"""Errors on the machine while agents learn: a critic, and groups of rollouts.
+"""The error of our agent on the machine while it learns, beside those of the PIDs.
 
-    python -m benchmarks.curves [FOLDER] [SEED]
+    python -m benchmarks.curves [SEED]
 
-FOLDER is one of `brokk-min reproduce`, by default results; all agents learn on its net.npz. Now and
-then, off the clock, the policy without its exploration drives the machine on goals that are never
-scored. The curves go to curves_SEED.json in FOLDER, and are drawn from there if it exists. The
-picture is docs/figures/learning.svg; it has the 2.5 hours of the paper as a line.
+Two trainings on the package's nets: the short one of `brokk-min train`, and all of the recipe. Now
+and then, off the clock, the policy without its exploration drives the machine on motions that are
+neither scored nor tuned on. The picture is docs/figures/learning.svg.
 """
 
-import json
-import math
 import sys
 import time
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from matplotlib import pyplot as plt
 
-import benchmarks  # noqa: F401, before NumPy computes: one thread
+import benchmarks  # before NumPy computes: one thread
 from benchmarks.peers import machine_error
 from brokk_min import ppo
-from brokk_min._files import write_json
-from brokk_min.identification.net_file import load_net
+from brokk_min.actuator import ActuatorNet
+from brokk_min.cli.training import FIRST_STEPS
+from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST, read_gains
+from brokk_min.evaluation.rollout import title
 from brokk_min.learning.checkpoint import actor_weights, prepare
-from brokk_min.learning.jobs import side_by_side
-from brokk_min.learning.policy import Policy
+from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.learning.recipes import find_recipe
 from brokk_min.machine import BROKK_170 as M
 
-AGENTS = {
-    "critic, the paper's observation": find_recipe(paper=True, critic=True),
-    "groups, the paper's observation": find_recipe(paper=True),
-    "groups, our observation": find_recipe(),
-}
-POINTS = 50  # of a curve
 RUNS = 32  # of 20 s, for each point
-PAPER_HOURS = 2.5
+GROWTH = 1.2  # of the steps between two points
+Curve = list[tuple[float, float, float]]  # steps, seconds of CPU, error [m/s]
 
 
-def learn(name: str, folder: Path, seed: int) -> list[dict[str, float]]:
-    """One training: steps, hours of CPU, and the error on the machine [m/s], point by point."""
+def learn(net: ActuatorNet, total_steps: int, seed: int) -> Curve:
+    """One training."""
     torch.set_num_threads(1)
-    recipe, net = AGENTS[name], load_net(folder / "net.npz", M)
+    recipe = find_recipe()
+    recipe = replace(recipe, learner=replace(recipe.learner, total_steps=total_steps))
     env, advantages, start = prepare(M, net, recipe, seed)
-    learner = recipe.learner
-    updates = math.ceil(learner.total_steps / (learner.num_envs * learner.horizon))
-    rows: list[dict[str, float]] = []
+    curve: Curve = []
     began = time.process_time()
+    due = 20_000.0  # steps of the next point
 
     def on_update(now: ppo.Checkpoint, *_: Any) -> None:
-        nonlocal began
-        if now.update % max(1, updates // POINTS) == 0 or now.update == updates:
-            hours = (time.process_time() - began) / 3600
+        nonlocal began, due
+        if now.global_step >= min(due, total_steps):
+            seconds, due = time.process_time() - began, GROWTH * now.global_step
             policy = Policy(M, {}, actor_weights(now.agent), net, recipe.interface)
-            error = machine_error(policy, RUNS)
-            rows.append({"steps": now.global_step, "hours": hours, "error": error})
-            began = time.process_time() - 3600 * hours
+            curve.append((now.global_step, seconds, machine_error(policy, RUNS)))
+            began = time.process_time() - seconds
 
     ppo.train(env, recipe.learner, seed, advantages, on_update, start)
-    return rows
+    return curve
 
 
-def draw(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
-    """Error against steps and against hours of one core, all logarithmic."""
+def draw(curves: dict[str, Curve], pids: dict[str, float], path: Path) -> None:
+    """Error against steps and against seconds, beside the PIDs' lines; all is logarithmic."""
     plt.rcParams.update({"svg.hashsalt": "learning", "svg.fonttype": "none"})
     figure, both = plt.subplots(1, 2, figsize=(8, 3.4), sharey=True, layout="constrained")
-    labels = {"steps": "environment steps", "hours": "hours of one core"}
-    for axes, (x, label) in zip(both, labels.items(), strict=True):
-        for name, rows in curves.items():
-            axes.plot([row[x] for row in rows], [row["error"] for row in rows], ".-", label=name)
-        axes.set(xscale="log", yscale="log", ylim=(0.01, None), xlabel=label)
-    axes.axvline(PAPER_HOURS, color="gray", linestyle=":", label="the paper's training")
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("{x:g}")
+    labels = ("environment steps", "seconds of one core")
+    for i, (axes, label) in enumerate(zip(both, labels, strict=True)):
+        for name, curve in curves.items():
+            axes.plot([row[i] for row in curve], [row[2] for row in curve], ".-", label=name)
+        for (name, error), line in zip(pids.items(), (":", "--", "-."), strict=True):
+            axes.axhline(error, color="0.4", linestyle=line, label=name)
+        axes.set(xscale="log", yscale="log", xlabel=label)
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
     both[0].set(ylabel="velocity error on the machine [m/s]")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     figure.savefig(path, metadata={"Date": None})
 
 
-def main(folder: str = "results", seed: str = "0") -> None:
-    file = Path(folder) / f"curves_{seed}.json"
-    if not file.exists():
-        jobs = {name: partial(learn, name, Path(folder), int(seed)) for name in AGENTS}
-        write_json(file, side_by_side(jobs))
-    curves = json.loads(file.read_text())
-    for name, rows in curves.items():
-        print(f"{name}: {rows[-1]['error']:.4f} m/s after {rows[-1]['hours']:.2f} h")
-    draw(curves, Path(__file__).parents[1] / "docs" / "figures" / "learning.svg")
+def main(seed: str = "0") -> None:
+    net = load_policy(benchmarks.POLICY, M).net
+    baselines = read_gains(benchmarks.POLICY.with_name("gains.json"), M, net)
+    names = (BY_HAND, OPTIMISED, STRONGEST)
+    pids = {title(name): machine_error(baselines[name], RUNS) for name in names}
+    curves = {
+        f"our agent, {steps:,} steps": learn(net, steps, int(seed))
+        for steps in (FIRST_STEPS, find_recipe().learner.total_steps)
+    }
+    for name, curve in curves.items():
+        print(f"{name}: {curve[-1][2]:.4f} m/s after {curve[-1][1]:.0f} s")
+        better = next(row for row in curve if row[2] < pids[title(OPTIMISED)])
+        print("below the optimised PID after {:,} steps and {:.0f} s".format(*better))
+    print(*(f"{name}: {error:.4f} m/s" for name, error in pids.items()), sep="\n")
+    draw(curves, pids, Path(__file__).parents[1] / "docs" / "figures" / "learning.svg")
 
 
 if __name__ == "__main__":

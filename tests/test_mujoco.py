@@ -92,7 +92,7 @@ def test_film__is_written_or_says_that_there_is_no_opengl(tmp_path):
         assert "OpenGL" in done.stderr.splitlines()[-1]
     else:
         with Image.open(out) as pictures:
-            assert pictures.size == (960, 360) and pictures.n_frames > 4
+            assert pictures.size == (880, 400) and pictures.n_frames > 4
 
 
 def test_own_mjcf__has_the_geometry_of_its_machine_and_obeys():

@@ -8,7 +8,7 @@ from pathlib import Path
 from brokk_min._files import require_package, write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.can.operator_input import read_commands
-from brokk_min.cli.options import Command, check, default_policy, find_plant
+from brokk_min.cli.options import Command, check, default_policy, find_plant, load_pids
 from brokk_min.evaluation import adaptive, baselines, metrics, sequences
 from brokk_min.evaluation.rollout import title, valves_at_rest
 from brokk_min.jacobian import JacobianController
@@ -25,7 +25,7 @@ class Evaluate(Command):
     starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
     plant: str = "analytic"  # What moves: analytic, net (of the policy), or FILE.py:NAME.
     json: Path | None = None  # Also write all runs here.
-    save_gains: Path | None = None  # Tune the PIDs though gains.json is beside POLICY; write it.
+    save_gains: Path | None = None  # Tune the PIDs, even if there are gains; write them here.
     num_starts: int = 16  # Without --starts: how many of the machine's.
     adapt: bool = False  # Also each controller as it learns its valves: cold, and after a minute.
     seed: int = 0  # Of the noise, and of what is drawn and tuned.
@@ -34,7 +34,8 @@ class Evaluate(Command):
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         check(self.seed >= 0, "--seed", "0 or more", self.seed)
         path, gains = default_policy(machine, self.policy)
-        gains = None if self.save_gains else gains
+        elsewhere = gains and gains.parent != path.parent and self.plant != "analytic"
+        gains = None if self.save_gains or elsewhere else gains
         self.writes(self.json, self.save_gains, reads=[path, gains])
         files = {"rl": path.name} if self.policy else POLICIES
         policies = {k: load_policy(path.with_name(f), machine) for k, f in files.items()}
@@ -73,7 +74,7 @@ class Evaluate(Command):
         """The baselines with the gains of a file, or with gains that are tuned now."""
         print(f"gains of the baselines: {path or 'tuned now'}", file=sys.stderr)
         if path:
-            return baselines.read_gains(path, machine, net)
+            return load_pids(machine, path, net)
         tuned = baselines.tuned_baselines(machine, net, baselines.EFFORT, self.seed, plant)
         if self.save_gains:
             meta = metrics.metadata(machine, self.seed) | baselines.gains_metadata(machine, net)
@@ -112,5 +113,5 @@ class Reproduce(Command):
         file = self.out / "results.json"
         check(self.force or not file.exists(), str(file), "no file (or --force)", "one")
         results = reproduce(machine, self.out, budget, self.seed)
-        print(table(results["task_space"]["runs"]))
+        print(table(results["task_space"]["runs"]), *results["trainings"], sep="\n")
         print(self.out / "report.html", file, sep="\n")

@@ -17,8 +17,8 @@ from brokk_min.beyond.adaptation import Adaptive, valves
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
 from brokk_min.can.simulated_machine import parse_fault, run_machine
-from brokk_min.cli.options import Command, check, default_policy, find_plant
-from brokk_min.evaluation.baselines import OPTIMISED, baselines, read_gains
+from brokk_min.cli.options import Command, check, default_policy, find_plant, load_pids
+from brokk_min.evaluation.baselines import OPTIMISED, baselines
 from brokk_min.evaluation.rollout import title
 from brokk_min.identification.valve_report import describe, load_known, save_known
 from brokk_min.learning.policy import load_policy
@@ -120,13 +120,13 @@ class DriveMachine(Command):
 def find_controller(
     machine: Machine, policy: Path | None, rl: bool
 ) -> tuple[Controller, ActuatorNet]:
-    """The policy, or the PID with the gains beside it (or by hand without); and their nets."""
+    """The policy, or the PID with the gains that there are (or by hand without); and their nets."""
     path, gains = default_policy(machine, policy)
     found = load_policy(path, machine)
     if rl:
         return found, found.net
     print(f"gains of the PID: {gains or 'set by hand'}")
-    pids = read_gains(gains, machine, found.net) if gains else baselines(machine, found.net)
+    pids = load_pids(machine, gains, found.net) if gains else baselines(machine, found.net)
     return pids[OPTIMISED], found.net
 
 

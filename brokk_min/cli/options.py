@@ -13,7 +13,9 @@ import numpy as np
 import tyro
 
 from brokk_min._files import NEW, SHIPPED, brief, expected
-from brokk_min.actuator import PLANT, Plant
+from brokk_min.actuator import PLANT, ActuatorNet, Plant
+from brokk_min.evaluation.baselines import Baselines, read_gains
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX, Machine, require
 
 FRACTIONS = ("gamma", "gae_lambda", "zero_goals", "axis_goals", "noise", "weight_decay")
@@ -121,11 +123,20 @@ def find_plant(name: str, machine: Machine) -> Plant:
 
 
 def default_policy(machine: Machine, policy: Path | None) -> tuple[Path, Path | None]:
-    """A policy, by default the package's, and the gains.json beside it, or None.
+    """A policy, by default the package's, and the gains.json beside it, or the package's, or None.
 
     WrongUse: the package has no policy for the machine.
     """
-    path = policy or SHIPPED / machine.name / "policy.npz"
+    shipped = SHIPPED / machine.name
+    path = policy or shipped / "policy.npz"
     check(bool(policy) or path.exists(), "--policy", f"one for {machine.name}", "none")
-    gains = path.with_name("gains.json")
-    return path, gains if gains.exists() else None
+    folders = [path.parent, shipped] if machine == BROKK_170 else [path.parent]
+    found = [folder / "gains.json" for folder in folders if (folder / "gains.json").exists()]
+    return path, found[0] if found else None
+
+
+def load_pids(machine: Machine, gains: Path, net: ActuatorNet) -> Baselines:
+    """The PIDs with the gains of a file for these nets; the package's keep the package's nets."""
+    if gains.parent == SHIPPED / machine.name:
+        net = load_policy(gains.with_name("policy.npz"), machine).net
+    return read_gains(gains, machine, net)

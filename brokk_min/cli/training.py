@@ -4,23 +4,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import tyro
 from tyro.conf import OmitArgPrefixes
 
-from brokk_min._files import require_package
-from brokk_min.cli.options import Command, check, check_settings
+from brokk_min._files import SHIPPED, require_package
+from brokk_min.actuator import ActuatorNet
+from brokk_min.cli.evaluation import table
+from brokk_min.cli.options import Command, check, check_settings, load_pids
+from brokk_min.evaluation import metrics, progress, sequences
 from brokk_min.identification.net_file import load_net
+from brokk_min.learning.policy import load_policy
 from brokk_min.learning.recipes import Recipe, find_recipe
-from brokk_min.machine import Machine
+from brokk_min.machine import BROKK_170, Machine
 from brokk_min.settings import PPOConfig, TaskConfig
+
+FIRST_STEPS = 400_000  # of our agent, of the five million of its recipe
+STARTS = 4  # for the table at the end
 
 
 @dataclass(kw_only=True)
 class Training(Command):
     """Options of trainings."""
 
-    actuator: Path  # Nets that `fit` wrote.
-    out: Path  # Policy to write, .npz; its curve and checkpoint lie beside it.
+    actuator: Path | None = None  # Nets that `fit` wrote; by default those of the package.
     paper: bool = False  # The paper's agent: its observation, actions and reward.
     critic: bool = False  # Advantages by a critic, as in the paper, not by groups of rollouts.
     seed: int = 0  # Of the weights, episodes and noise.
@@ -31,8 +36,15 @@ class Training(Command):
     def defaults(cls, options: list[str]) -> Any:
         """The settings of the agent that the options name."""
         recipe = find_recipe("--paper" in options, "--critic" in options)
-        required: Any = tyro.MISSING
-        return cls(actuator=required, out=required, learner=recipe.learner, task=recipe.task)
+        return cls(learner=recipe.learner, task=recipe.task)
+
+    def find_net(self, machine: Machine) -> ActuatorNet:
+        """The nets to learn on."""
+        if self.actuator:
+            return load_net(self.actuator, machine)
+        shipped = SHIPPED / machine.name / "policy.npz"
+        check(shipped.exists(), "--actuator", f"nets of {machine.name}", "none")
+        return load_policy(shipped, machine).net
 
     def recipe(self) -> Recipe:
         """The agent, its learner and its task."""
@@ -49,33 +61,52 @@ class Training(Command):
 
 @dataclass(kw_only=True)
 class Train(Training):
-    """Train a policy on the nets by PPO."""
+    """Train a policy by PPO, half a minute long; --total-steps 5000000 is our agent to its end."""
 
+    out: Path = Path("policy.npz")  # Policy to write; its curve and checkpoint lie beside it.
     resume: bool = False  # Go on from OUT.checkpoint; the end is the same as without the break.
+
+    @classmethod
+    def defaults(cls, options: list[str]) -> Any:
+        """A first training of our agent is short."""
+        made = super().defaults(options)
+        if not {"--paper", "--critic"} & {*options}:
+            made.learner = replace(made.learner, total_steps=FIRST_STEPS)
+        return made
 
     def __call__(self, machine: Machine) -> None:
         recipe = self.recipe()
         from brokk_min.learning.checkpoint import train_policy
 
         self.writes(self.out)
+        net, look = self.find_net(machine), None
+        if machine == BROKK_170:  # the package has PIDs of it
+            pids = load_pids(machine, SHIPPED / machine.name / "gains.json", net)
+            look = progress.beside_pids(machine, pids)
         checkpoint = Path(f"{self.out}.checkpoint")
         try:
             checkpoint.touch(exist_ok=self.resume)  # the name is taken, for other trainings
         except FileExistsError:
             check(False, str(checkpoint), "--resume or no checkpoint", "one")
         try:
-            train_policy(machine, load_net(self.actuator, machine), recipe, self.seed, self.out)
+            policy = train_policy(machine, net, recipe, self.seed, self.out, look)
         finally:
             if checkpoint.exists() and not checkpoint.stat().st_size:  # nothing is learned yet
                 checkpoint.unlink()
-        print(f"{self.out}: trained; curve in {self.out}.csv")
+        if machine == BROKK_170:
+            commands = sequences.axis_sequences(machine)
+            starts = sequences.evaluation_starts(machine, STARTS, commands, 0)
+            name = "rl_paper" if self.paper else "rl"
+            runs, _ = metrics.evaluate(machine, {name: policy, **pids}, commands, starts, self.seed)
+            print(table(runs))
+        print(f"{self.out}: trained; curve in {self.out}.csv; `brokk-min play --policy {self.out}`")
 
 
 @dataclass(kw_only=True)
 class Sweep(Training):
     """Train and evaluate many seeds, one process each; finished seeds are not run again."""
 
-    out: Path  # Folder to write policies, their curves and sweep.json to.
+    out: Path = Path("sweep")  # Folder to write policies, their curves and sweep.json to.
     seeds: int = 10  # How many, from --seed on.
     scheduler: str | None = None  # tcp://... of dask; its workers must see OUT. None: this machine.
     num_starts: int = 16  # Start poses for each scored sequence.
@@ -89,8 +120,7 @@ class Sweep(Training):
         check(self.seeds > 0, "--seeds", "1 or more", self.seeds)
         check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         seeds = range(self.seed, self.seed + self.seeds)
-        net = load_net(self.actuator, machine)
-        task = machine, net, recipe, seeds, self.out, self.num_starts
+        task = machine, self.find_net(machine), recipe, seeds, self.out, self.num_starts
         table = sweep(*task, self.scheduler, self.robustness)
         print("mean over seeds (95 % interval)")
         print("\n".join(f"{key:24} {interval_text(table['all'][key])}" for key in COLUMNS))

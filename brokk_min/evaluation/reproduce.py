@@ -20,13 +20,14 @@ from brokk_min.evaluation import (
     report,
     sequences,
 )
+from brokk_min.evaluation.rollout import title
 from brokk_min.fit import SINE, Excitation, Log, collect
 from brokk_min.identification import fitting, logs
 from brokk_min.identification.net_file import save_net, select_nets
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, Policy
-from brokk_min.learning.recipes import find_recipe
+from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.machine import Array, Machine
 from brokk_min.settings import TaskConfig
 
@@ -55,7 +56,7 @@ class Budget:
     short_s: float = 26.0  # s, longest run for robustness
 
 
-QUICK = Budget(0.1, 700, 100_000, (4, 4, 3.0), 4, 3.0)
+QUICK = Budget(0.3, 2000, 400_000, (4, 8, 10.0), 4, 3.0)
 
 
 @dataclass(frozen=True)
@@ -101,11 +102,18 @@ def fit_net(chain: Chain, name: str, log: Log, recipe: Mapping[str, Any]) -> Act
     return net
 
 
+def recipe_of(name: str) -> Recipe:
+    """The recipe of one of `TRAINED`."""
+    recipe = find_recipe(paper=name != "rl", critic=name.startswith("rl_critic"))
+    if name == "rl_critic_nets":
+        return replace(recipe, learner=replace(recipe.learner, total_steps=CRITIC_STEPS))
+    return recipe
+
+
 def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     """One of `TRAINED`, by its own recipe."""
-    recipe = find_recipe(paper=name != "rl", critic=name.startswith("rl_critic"))
-    longest = CRITIC_STEPS if name == "rl_critic_nets" else recipe.learner.total_steps
-    steps = chain.budget.train_steps or longest
+    recipe = recipe_of(name)
+    steps = chain.budget.train_steps or recipe.learner.total_steps
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=steps))
     driven, seed = select_nets(chain.machine, net), chain.seed + SEEDS[name]
     return train_policy(chain.machine, driven, recipe, seed, chain.out / TRAINED[name])
@@ -152,6 +160,7 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
         "task_space": {"runs": runs, "means": metrics.means(runs)},
         "pairs": compare_pairs(runs),
         "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
+        "trainings": trainings(budget, runs),
         "robustness": mean_errors(robustness(machine, controllers, net, short, starts[:16], seed)),
         "starts": starts.tolist(),
     }
@@ -166,6 +175,23 @@ def compare_pairs(runs: Sequence[metrics.Run]) -> list[dict[str, Any]]:
             figures = {key: metrics.compare(runs, policy, pid, key) for key in COMPARED}
             rows.append({"policy": policy, "pid": pid, "figures": figures})
     return rows
+
+
+def trainings(budget: Budget, runs: Sequence[metrics.Run]) -> list[str]:
+    """What a reader must know of learners that did not learn to the end: a line for each."""
+
+    def error(name: str) -> float:
+        return float(metrics.by_start(runs, name, "all", "velocity_error_mean").mean())
+
+    lines = []
+    for name in TRAINED:
+        whole = recipe_of(name).learner.total_steps
+        if steps := budget.train_steps:
+            better = error(name) < error(baselines.BY_HAND)
+            said = "better" if better else "needs more to be better"
+            line = f"{title(name)}: after {steps:,} of {whole:,} steps {said} than the PID by hand"
+            lines.append(line)
+    return lines
 
 
 def variations(machine: Machine) -> dict[str, Machine]:

@@ -2,6 +2,8 @@
 
 import io
 import json
+import math
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,34 +27,48 @@ from brokk_min.machine import Machine
 from brokk_min.ppo import Agent, Checkpoint, Rollout
 
 EVERY = 50  # updates between two checkpoints
+LOOKS = 10  # at the policy in a training
 Curve = list[dict[str, float]]  # of a learning curve
 Env = VectorEnv[Any, Any, Any]  # a `TaskVectorEnv`, or groups in one
 
 
 def train_policy(
-    machine: Machine, net: ActuatorNet, recipe: Recipe, seed: int, out: Path
+    machine: Machine,
+    net: ActuatorNet,
+    recipe: Recipe,
+    seed: int,
+    out: Path,
+    look: Callable[[Policy], str] | None = None,
 ) -> Policy:
     """Train a policy on the nets of the driven joints and write it to `out`.
 
     The same `seed` gives the same bits on the same computer. `<out>.checkpoint` and the curve
     `<out>.csv` lie next to the policy. Where a checkpoint exists, the training goes on from it, and
-    the result is the same as without the break. ValueError: a checkpoint of another training, or a
-    loss that is not finite.
+    the result is the same as without the break. Ten times what `look` says of the policy without
+    its exploration is printed. ValueError: a checkpoint of another training, or a loss that is not
+    finite.
     """
     about: dict[str, Any] = {"contract": contract(machine, recipe.interface)}
     about |= {"actuator": fingerprint(net), "seed": seed, "recipe": asdict(recipe)}
     torch.set_num_threads(1)  # several wait in vain on busy cores
     config, checkpoint = recipe.learner, Path(f"{out}.checkpoint")
     env, advantages, start = prepare(machine, net, recipe, seed)
+    updates = math.ceil(config.total_steps / (config.num_envs * config.horizon))
     rows: Curve = []
     if checkpoint.exists() and checkpoint.stat().st_size:
         start, rows = load(checkpoint, about, env, start)
+
+    def policy_of(agent: Agent) -> Policy:
+        training = about | {"made_with": made_with()}
+        return Policy(machine, training, actor_weights(agent), net, recipe.interface)
 
     def on_update(now: Checkpoint, rollout: Rollout, metrics: dict[str, float]) -> None:
         error = float(np.mean([info["velocity_error"].mean() for info in rollout.infos]))
         rows.append({"global_step": now.global_step, **metrics, "charts/velocity_error": error})
         bar.update(now.global_step - bar.n)
         bar.set_postfix_str(f"error {error:.3f} m/s")
+        if look and now.update % max(1, updates // LOOKS) == 0:
+            bar.write(f"{now.global_step:,} steps: {look(policy_of(now.agent))}")
         if now.update % EVERY == 0 or now.global_step >= config.total_steps:
             write_csv(Path(f"{out}.csv"), rows[0], [row.values() for row in rows])
             save(checkpoint, about, env, now, rows)
@@ -60,8 +76,7 @@ def train_policy(
     size: dict[str, Any] = {"total": config.total_steps, "initial": start.global_step}
     with tqdm(desc="train", **size, unit="step", unit_scale=True, disable=None) as bar:
         agent = ppo.train(env, config, seed, advantages, on_update, start)
-    training = about | {"made_with": made_with()}
-    policy = Policy(machine, training, actor_weights(agent), net, recipe.interface)
+    policy = policy_of(agent)
     save_policy(out, policy)
     checkpoint.unlink(missing_ok=True)
     return policy

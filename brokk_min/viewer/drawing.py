@@ -34,6 +34,7 @@ class Scene(NamedTuple):
     trail: Array = np.zeros((0, 3))  # past tool positions [m], (T, 3)
     title: str = ""
     status: str = ""
+    notes: str = ""  # lines in the side view
 
 
 def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
@@ -48,6 +49,7 @@ def draw(machine: Machine, scene: Scene, size: tuple[int, int]) -> Image.Image:
     pen = ImageDraw.Draw(image)
     pen.text((28, HEAD / 2), scene.title, INK, _font(30), "lm")
     pen.text((image.width - 28, HEAD / 2), scene.status, MUTED, _font(26), "rm")
+    pen.text((28, HEAD + 50), scene.notes, INK, _font(26), spacing=14)
     for i in range(machine.n):
         _joint_row(pen, machine, scene, i, image.size)
     return image.reduce(2)

@@ -23,7 +23,13 @@ TRAIL = 600  # positions of the tool that are shown
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"))
 PAD_AXES = (1, 0, 3)
 UNSEEN = "SDL_VIDEODRIVER=dummy draws unseen"
-HELP = "arrows, W, S: move    left SHIFT: slowly    TAB: the other controller    ESC: end"
+HELP = """arrows: along x and y
+W, S: up and down
+left SHIFT: slowly
+TAB: the other controller
+F1: these keys
+ESC: end"""
+HELP_SECONDS = 10.0  # for which it stands there at first
 
 
 class Keyboard:
@@ -62,12 +68,17 @@ class Session:
         self.state = initial_state(machine, start_pose(machine)[None], np.zeros(3), plant)
         self.trail: deque[Array] = deque(maxlen=TRAIL)  # of the tool [m]
         self.turns = cycle(controllers.items())
+        self.seconds, self.help_until = 0.0, HELP_SECONDS
         self.switch()
 
     def switch(self) -> None:
         """The next controller goes on from here."""
         self.name, self.controller = next(self.turns)
         self.memory = self.controller.start(1)
+
+    def toggle_help(self) -> None:
+        """Show the keys, or hide them."""
+        self.help_until = 0.0 if self.seconds < self.help_until else np.inf
 
     def tick(self, v_goal: Array) -> Scene:
         """Controller and plant go on by a tick, with this goal velocity [m/s] (3,)."""
@@ -76,8 +87,10 @@ class Session:
         u, self.memory = self.controller(measured, self.memory)
         self.state = s = transition(self.machine, self.plant, self.state, u)
         self.trail.append(tool_position(forward_kinematics(self.machine, s.q[0])))
-        trail, status = np.array(self.trail), f"{s.ticks[0] * self.machine.dt:.1f} s"
-        return Scene(s.q[0], u[0], s.v_goal[0], s.v_tool[0], trail, self.name, status)
+        self.seconds = float(s.ticks[0] * self.machine.dt)
+        trail, status = np.array(self.trail), f"{self.seconds:.1f} s"
+        notes = HELP if self.seconds < self.help_until else ""
+        return Scene(s.q[0], u[0], s.v_goal[0], s.v_tool[0], trail, self.name, status, notes)
 
 
 def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PLANT) -> None:
@@ -93,6 +106,8 @@ def play(machine: Machine, controllers: dict[str, Controller], plant: Plant = PL
                     return
                 if key == "tab":
                     session.switch()
+                if key == "f1":
+                    session.toggle_help()
             scene = session.tick(keyboard.velocity())
             pixels = draw(machine, scene, WINDOW).tobytes()
             window.blit(pygame.image.frombytes(pixels, WINDOW, "RGB"), (0, 0))
@@ -110,5 +125,5 @@ def open_window(pygame: Any) -> Any:
     unseen = pygame.display.get_driver() in ("offscreen", "dummy")
     if unseen and "SDL_VIDEODRIVER" not in os.environ:
         raise pygame.error("none")
-    pygame.display.set_caption(f"brokk_min: {HELP}")
+    pygame.display.set_caption("brokk_min: F1 shows the keys")
     return window

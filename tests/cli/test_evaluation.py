@@ -6,6 +6,7 @@ import pytest
 from helpers_cli import run
 from helpers_machines import obedient_net, pids
 
+from brokk_min._files import SHIPPED
 from brokk_min.evaluation import adaptive, baselines
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.learning.policy import POLICIES
@@ -49,11 +50,26 @@ def test_evaluate__tunes_pids_anew_and_again_by_what_the_file_says(folder, capsy
     assert "gains of the baselines: tuned now" in capsys.readouterr().err
     meta = json.loads(gains.read_text())["meta"]
     assert (meta["seed"], meta["plant"], meta["effort"]) == (3, "analytic", [1, 1, 1.0])
-    (folder / "gains.json").unlink()  # without, PIDs are tuned, too
-    assert evaluate(folder, f"--json {again} --seed {meta['seed']}") == 0
+    options = f"--save-gains {gains} --json {again} --force --seed {meta['seed']}"
+    assert evaluate(folder, options) == 0
     first, again = (json.loads(file.read_text()) for file in (first, again))
     assert first["meta"]["gains"] == again["meta"]["gains"] == "tuned now"
     assert again["runs"] == first["runs"]
+
+
+def test_evaluate__takes_the_packages_pids_where_a_policy_has_none(folder, monkeypatch):
+    """With the nets that they know, not the policy's; on another plant they are tuned."""
+    (folder / "gains.json").unlink()
+    shipped = SHIPPED / BROKK_170.name
+    assert evaluate(folder, f"--json {folder}/own.json") == 0
+    policy = f"--policy {shipped}/policy.npz"
+    assert evaluate(folder, f"--json {folder}/package.json {policy}") == 0
+    own, package = (json.loads((folder / f"{n}.json").read_text()) for n in ("own", "package"))
+    assert own["meta"]["gains"] == package["meta"]["gains"] == str(shipped / "gains.json")
+    assert own["runs"][1:] == package["runs"][1:] and own["runs"][0] != package["runs"][0]
+    monkeypatch.setattr(baselines, "tuned_baselines", lambda *_: {})
+    assert evaluate(folder, f"--plant {folder}/plant.py:PLANT --json {folder}/e.json") == 0
+    assert json.loads((folder / "e.json").read_text())["meta"]["gains"] == "tuned now"
 
 
 def test_evaluate__has_policies_and_poses_of_the_package(folder, capsys):

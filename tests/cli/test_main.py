@@ -11,6 +11,7 @@ from helpers_bus import raises
 from helpers_cli import run
 
 import brokk_min
+from brokk_min.cli.training import FIRST_STEPS
 from brokk_min.learning.recipes import find_recipe
 
 ROOT = Path(__file__).parents[2]
@@ -21,7 +22,8 @@ def test_help__shows_the_defaults_of_the_agent_that_is_named(capsys):
         assert run(" ".join(["train", *words, "--help"])) == 0
         learner = find_recipe("--paper" in words, "--critic" in words).learner
         page = " ".join(capsys.readouterr().out.split())
-        assert f"(default: {learner.total_steps})" in page and f"(default: {learner.gamma})" in page
+        steps = learner.total_steps if words else FIRST_STEPS
+        assert f"(default: {steps})" in page and f"(default: {learner.gamma})" in page
 
 
 HELP = """

@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers_cli import run
-from helpers_machines import small_net
+from helpers_machines import short_axes, small_net
 
-from brokk_min.identification.net_file import save_net
+from brokk_min._files import SHIPPED
+from brokk_min.evaluation import progress, sequences
+from brokk_min.evaluation.rollout import title
+from brokk_min.identification.net_file import fingerprint, save_net
 from brokk_min.learning import checkpoint
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
@@ -23,15 +26,33 @@ SMALL = "--num-envs 8 --horizon 8 --minibatch-size 32 --total-steps 128"
     ("options", "interface", "learner"),
     [
         ("--gamma 0.8", "beyond", {"gamma": 0.8, "total_steps": 128, "num_envs": 8}),
-        ("--paper --critic --clip 0.1", "paper", {"clip": 0.1, "gae_lambda": 0.95}),
+        (
+            "--paper --critic --clip 0.1 --actuator net.npz",
+            "paper",
+            {"clip": 0.1, "gae_lambda": 0.95},
+        ),
     ],
 )
-def test_train__has_its_settings_from_the_line(tmp_path, capsys, options, interface, learner):
-    save_net(tmp_path / "net.npz", small_net(BROKK_170, np.random.default_rng(0)))
-    files = f"--actuator {tmp_path}/net.npz --out {tmp_path}/p.npz"
-    assert run(f"train {files} {SMALL} {options} --hold-max-s 9 --seed 4") == 0
-    assert "trained; curve in" in capsys.readouterr().out
-    policy = load_policy(tmp_path / "p.npz", BROKK_170)
+def test_train__has_its_settings_from_the_line(
+    tmp_path, capsys, monkeypatch, options, interface, learner
+):
+    """Without --actuator on the nets of the package; the policy's row is beside the PIDs'."""
+    short = short_axes(60, 1)
+    monkeypatch.setattr(sequences, "axis_sequences", lambda machine: short)
+    monkeypatch.setattr(progress, "SECONDS", 0.5)
+    monkeypatch.chdir(tmp_path)
+    net = small_net(BROKK_170, np.random.default_rng(0))
+    save_net(tmp_path / "net.npz", net)
+    assert run(f"train {SMALL} {options} --hold-max-s 9 --seed 4") == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"^128 steps: 0\.\d{4} m/s; the PID tuned by hand has 0\.", printed, re.M)
+    errors = dict(re.findall(r"^(P.*\w|s.*\w) +(?:open|closed) +(\S+)", printed, re.M))
+    assert float(errors["PID optimised"]) < float(errors["PID by hand"]) < 0.06
+    assert float(errors[title("rl" if interface == "beyond" else "rl_paper")]) > 0.06
+    assert run(f"train {SMALL} {options}") == 2  # it is there
+    policy = load_policy(tmp_path / "policy.npz", BROKK_170)
+    shipped = load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170).net
+    assert fingerprint(policy.net) == fingerprint(net if "--actuator" in options else shipped)
     assert policy.interface == interface
     recipe = policy.training["recipe"]
     assert recipe["task"]["hold_max_s"] == 9 and policy.training["seed"] == 4

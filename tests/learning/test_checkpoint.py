@@ -35,8 +35,8 @@ def often(monkeypatch):
     monkeypatch.setattr("brokk_min.learning.checkpoint.EVERY", 2)
 
 
-def run(path, kind="ours", seed=5, net=NET):
-    return train_policy(BROKK_170, net, RECIPES[kind], seed, path)
+def run(path, kind="ours", seed=5, net=NET, look=None):
+    return train_policy(BROKK_170, net, RECIPES[kind], seed, path, look)
 
 
 def run_until_interrupted(path, kind="ours"):
@@ -72,7 +72,10 @@ def test_prepare__begins_what_the_recipe_says(paper, critic):
 
 @pytest.mark.parametrize("kind", ["ours", "paper"])
 def test_train_policy__goes_on_after_an_interruption_to_the_same_files(tmp_path, kind):
-    straight = run(tmp_path / "straight.npz", kind)
+    """To look at the policy meanwhile changes nothing."""
+    seen = []
+    straight = run(tmp_path / "straight.npz", kind, look=seen.append)
+    assert len(seen) == 4 and all(map(np.array_equal, seen[-1].weights, straight.weights))
     path = tmp_path / "p.npz"
     run_until_interrupted(path, kind)
     assert os.path.exists(f"{path}.checkpoint") and not path.exists()

@@ -82,12 +82,12 @@ def test_readme__errors_on_changed_machines_are_those_of_the_sweep() -> None:
 
 def test_readme__lists_the_wings() -> None:
     wings = {path.parent.name for path in (ROOT / "brokk_min").glob("*/__init__.py")}
-    assert set(re.findall(r"^- `(\w+)/` ", README.read_text(), re.M)) == wings
+    assert set(re.findall(r"`(\w+)/`", README.read_text())) == wings
 
 
 def test_readme__examples_run() -> None:
     failed, run = doctest.testfile(str(README), module_relative=False)
-    assert run >= 10
+    assert run >= 8
     assert failed == 0
 
 

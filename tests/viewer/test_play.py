@@ -71,10 +71,11 @@ def test_gamepad__drives_until_it_is_unplugged(keyboard):
 
 
 def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch, held):
-    """In real time: arrow key, and through pygame's queue the other controller, and closing."""
+    """In real time: arrow key; through pygame's queue F1, the other controller, and closing."""
     scenes, draw = [], play.draw
-    tab = pygame.event.Event(pygame.KEYDOWN, key=pygame.K_TAB)
-    events = {20: tab, 22: pygame.event.Event(pygame.QUIT)}
+    tab, f1 = (pygame.event.Event(pygame.KEYDOWN, key=k) for k in (pygame.K_TAB, pygame.K_F1))
+    events = {12: f1, 20: tab, 22: pygame.event.Event(pygame.QUIT)}
+    monkeypatch.setattr(play, "HELP_SECONDS", 0.4)
 
     def each_picture(machine, scene, size):
         scenes.append(scene)
@@ -87,6 +88,7 @@ def test_play__moves_the_machine_by_keys_until_the_window_is_closed(monkeypatch,
     assert run("play") == 0 and not pygame.display.get_init()
     titles = [TITLES["rl"]] * 20 + [TITLES["jacobian_pid_k0.1"]] * 2
     assert [scene.title for scene in scenes] == titles
+    assert [bool(scene.notes) for scene in scenes] == [*[True] * 7, *[False] * 5, *[True] * 10]
     assert scenes[19].v_tool[1] > 0.1 and scenes[19].u.any() and scenes[19].status == "1.0 s"
     fk = forward_kinematics(BROKK_170, np.array([scene.q for scene in scenes]))
     np.testing.assert_allclose(scenes[-1].trail, tool_position(fk))
