@@ -31,7 +31,7 @@ COMMANDS: dict[str, Any] = {
     "replay": operating.Replay,
     "export": operating.Export,
 }
-LINES = "\n".join(f"  {name:10} {command.__doc__}" for name, command in COMMANDS.items())
+LINES = "\n".join(f"  {name:10} {of.__doc__.splitlines()[0]}" for name, of in COMMANDS.items())
 
 
 def main(arguments: list[str] | None = None) -> int:

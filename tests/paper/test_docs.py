@@ -19,7 +19,7 @@ from brokk_min.machine import BROKK_170
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-PAGES = [README, ROOT / "PAPER.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [README, ROOT / "PAPER.md", *sorted(ROOT.glob("d*/*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 ROW = re.compile(r"^\| \[`(\w+)\.py`\]\(brokk_min/\1\.py\) \| (\d+) \|", re.M)
 
