@@ -62,8 +62,9 @@ def test_readme__lists_the_wings() -> None:
     assert set(re.findall(r"^- `(\w+)/` ", README.read_text(), re.M)) == wings
 
 
-def test_readme__examples_run() -> None:
-    failed, run = doctest.testfile(str(README), module_relative=False)
+@pytest.mark.parametrize("page", [README, ROOT / "docs" / "course.md"], ids=lambda page: page.stem)
+def test_examples__run(page: Path) -> None:
+    failed, run = doctest.testfile(str(page), module_relative=False)
     assert run >= 10
     assert failed == 0
 
