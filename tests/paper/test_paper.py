@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MAKER = runpy.run_path(str(ROOT / "docs" / "annotated.py"))
+MAKER = runpy.run_path(str(ROOT / "docs" / "paper.py"))
 definition, name_of = MAKER["definition"], MAKER["name_of"]
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 PAGE = ROOT / "PAPER.md"
-PAPER, LINKS = PAGE.read_text().split(
+PAPER, LINKS = MAKER["TABLES"].split(
     "<!-- links: written by `python tests/paper/test_paper.py` -->\n"
 )
 
