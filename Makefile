@@ -38,7 +38,7 @@ docs: .venv/installed-dev
 	.venv/bin/python tests/paper/test_docs.py
 	.venv/bin/python tests/paper/test_paper.py
 	.venv/bin/python tests/paper/test_walkthrough.py
-	.venv/bin/python docs/annotated.py
+	.venv/bin/python docs/paper.py
 
 .venv/bin/python:
 	$(if $(PYTHON),,$(error PYTHON: expected Python 3.11 or newer with venv, found none of $(NAMES)))

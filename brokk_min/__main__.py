@@ -33,7 +33,7 @@ COMMANDS: dict[str, Any] = {
     "export": operating.Export,
 }
 NARROWEST = 20  # columns of a terminal
-LINES = "\n".join(f"  {name:10} {command.__doc__}" for name, command in COMMANDS.items())
+LINES = "\n".join(f"  {name:10} {of.__doc__.splitlines()[0]}" for name, of in COMMANDS.items())
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -161,7 +161,14 @@ def status(drive: hw.Drive) -> str:
 
 @dataclass(kw_only=True)
 class Play(Command):
-    """Drive a simulated machine with keyboard or gamepad in a window; see docs/play.md."""
+    """Drive a simulated machine with keyboard or gamepad in a window.
+
+    Arrows move the tool along x (up in the top view) and y, W and S move it up and down, and left
+    SHIFT slows it to a third. TAB hands over from the policy to the optimised PID and back; ESC
+    ends. On a gamepad the left stick is x and y, the right one z. A black arrow is the goal
+    velocity, a green one the measured velocity; below stand the angles within their ranges and
+    the valve commands. On a busy computer the machine moves slower than life.
+    """
 
     policy: Path | None = None  # Policy that `train` wrote, with gains.json beside it.
     plant: str = "analytic"  # What moves, or FILE.py:NAME.

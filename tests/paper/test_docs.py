@@ -19,7 +19,7 @@ from brokk_min.machine import BROKK_170
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-PAGES = [README, ROOT / "PAPER.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [README, ROOT / "PAPER.md", *sorted(ROOT.glob("d*/*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 ROW = re.compile(r"^\| \[`(\w+)\.py`\]\(brokk_min/\1\.py\) \| (\d+) \|", re.M)
 
@@ -85,8 +85,9 @@ def test_readme__lists_the_wings() -> None:
     assert set(re.findall(r"`(\w+)/`", README.read_text())) == wings
 
 
-def test_readme__examples_run() -> None:
-    failed, run = doctest.testfile(str(README), module_relative=False)
+@pytest.mark.parametrize("page", [README, ROOT / "docs" / "course.md"], ids=lambda page: page.stem)
+def test_examples__run(page: Path) -> None:
+    failed, run = doctest.testfile(str(page), module_relative=False)
     assert run >= 8
     assert failed == 0
 

@@ -17,11 +17,11 @@ from brokk_min._files import SHIPPED
 from brokk_min.evaluation.claims import verdict_rows
 
 ROOT = Path(__file__).parents[2]
-MAKER = runpy.run_path(str(ROOT / "docs" / "annotated.py"))
+MAKER = runpy.run_path(str(ROOT / "docs" / "paper.py"))
 definition, name_of = MAKER["definition"], MAKER["name_of"]
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 PAGE = ROOT / "PAPER.md"
-PAPER, LINKS = PAGE.read_text().split(
+PAPER, LINKS = MAKER["TABLES"].split(
     "<!-- links: written by `python tests/paper/test_paper.py` -->\n"
 )
 

@@ -1,4 +1,4 @@
-"""docs/annotated.md is what its template, the code and PAPER.md give today."""
+"""The text of PAPER.md is what its template, the code and the tables give today."""
 
 import re
 import runpy
@@ -7,11 +7,11 @@ from pathlib import Path
 from matplotlib.mathtext import MathTextParser
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs/annotated.md").read_text()
+PAGE = (ROOT / "PAPER.md").read_text()
 
 
 def test_page__is_what_the_sources_give() -> None:
-    assert runpy.run_path(str(ROOT / "docs/annotated.py"))["render"]() == PAGE, "run `make docs`"
+    assert runpy.run_path(str(ROOT / "docs/paper.py"))["render"]() == PAGE, "run `make docs`"
 
 
 def test_formulas__survive_markdown() -> None:

@@ -1,7 +1,7 @@
-"""Write docs/annotated.md: `python docs/annotated.py`.
+"""Write the text of PAPER.md, up to its tables: `python docs/paper.py`.
 
-The text is in annotated.md.j2. The code on the page comes from the package by name, and the
-deviations come from PAPER.md.
+The text is in paper.md.j2. The code on the page comes from the package by name, and the deviations
+come from the page's own tables.
 """
 
 from __future__ import annotations
@@ -15,10 +15,17 @@ from typing import Any
 
 import jinja2
 
+from brokk_min.env import observation_table
+from brokk_min.machine import BROKK_170
+
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
-PAGE = DOCS / "annotated.md"
-PAPER = (ROOT / "PAPER.md").read_text()
+PAGE = ROOT / "PAPER.md"
+MARKS = (
+    "<!-- text: written by `python docs/paper.py` from docs/paper.md.j2 -->\n",
+    "<!-- tables -->\n",
+)
+HEAD, _, TABLES = re.split("|".join(MARKS), PAGE.read_text())
 HEADINGS = re.findall(r"^### ((\w+)\. .*)$", (DOCS / "deviations.md").read_text(), re.M)
 
 
@@ -70,16 +77,16 @@ def code(symbol: str, *parts: list[str]) -> str:
     blocks = [textwrap.dedent("\n".join(lines[i - 1] for i in numbers)) for numbers in ranges]
     place = path.relative_to(ROOT).as_posix()
     end = "" if ranges[-1][-1] == ranges[0][0] else f"-L{ranges[-1][-1]}"
-    link = f"[`{symbol}`](../{place}#L{ranges[0][0]}{end})"
+    link = f"[`{symbol}`]({place}#L{ranges[0][0]}{end})"
     return f"{link}:\n\n```python\n" + "\n...\n".join(blocks).strip("\n") + "\n```"
 
 
 @cache
 def row(name: str) -> list[str]:
     """Cells of a deviation D or assumption A in PAPER.md."""
-    found = re.findall(rf"^\| ({name} \|.*)\|$", PAPER, re.M)
+    found = re.findall(rf"^\| ({name} \|.*)\|$", TABLES, re.M)
     if len(found) != 1:
-        raise ValueError(f"{name}: expected one row in PAPER.md, got {len(found)}")
+        raise ValueError(f"{name}: expected one row of the tables, got {len(found)}")
     return [cell.strip() for cell in found[0].split("|")]
 
 
@@ -87,7 +94,7 @@ def link(name: str) -> str:
     """A link to the experiments behind a deviation or assumption."""
     heading = next(heading for heading, found in HEADINGS if found == name)
     anchor = re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
-    return f"[{name}](deviations.md#{anchor})"
+    return f"[{name}](docs/deviations.md#{anchor})"
 
 
 def deviation(*names: str) -> str:
@@ -118,13 +125,15 @@ def wrap(page: str) -> str:
 
 
 def render() -> str:
-    """The page."""
+    """The page, with the text of today."""
     loader = jinja2.FileSystemLoader(DOCS)
     environment = jinja2.Environment(
         loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, autoescape=False
     )
-    environment.globals |= {"code": code, "deviation": deviation, "A": link}
-    return wrap(environment.get_template("annotated.md.j2").render())
+    observed = observation_table(BROKK_170).mean.size
+    environment.globals |= {"code": code, "deviation": deviation, "A": link, "observed": observed}
+    text = wrap(environment.get_template("paper.md.j2").render())
+    return f"{HEAD}{MARKS[0]}\n{text}\n{MARKS[1]}{TABLES}"
 
 
 if __name__ == "__main__":
