@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.actuator import PLANT, Plant
+from brokk_min.actuator import PLANT, AnalyticPlant, Plant
 from brokk_min.can import canopen
 from brokk_min.can.canopen import OPERATIONAL, WATCHDOG, Frame, checksum
 from brokk_min.can.connection import Bus, open_bus, stop_signals
@@ -178,7 +178,9 @@ class FaultyMachine(SimulatedMachine):
         plant: Plant = PLANT,
         faults: Sequence[Fault] = (),
     ) -> None:
-        super().__init__(machine, q, now, plant, STEP if plant is PLANT else machine.dt)
+        super().__init__(
+            machine, q, now, plant, STEP if isinstance(plant, AnalyticPlant) else machine.dt
+        )
         self.faults = [*faults]
         self.last: dict[int, bytes] = {}  # sound data of each node
         self.frames = dict.fromkeys(self.nmt, 0)  # of each node, so far

@@ -79,16 +79,16 @@ class Train(Training):
         from brokk_min.learning.checkpoint import train_policy
 
         self.writes(self.out)
-        net, look = self.find_net(machine), None
-        if machine == BROKK_170:  # the package has PIDs of it
-            pids = load_pids(machine, SHIPPED / machine.name / "gains.json", net)
-            look = progress.beside_pids(machine, pids)
         checkpoint = Path(f"{self.out}.checkpoint")
         try:
             checkpoint.touch(exist_ok=self.resume)  # the name is taken, for other trainings
         except FileExistsError:
             check(False, str(checkpoint), "--resume or no checkpoint", "one")
         try:
+            net, look = self.find_net(machine), None
+            if machine == BROKK_170:  # the package has PIDs of it
+                pids = load_pids(machine, SHIPPED / machine.name / "gains.json", net)
+                look = progress.beside_pids(machine, pids)
             policy = train_policy(machine, net, recipe, self.seed, self.out, look)
         finally:
             if checkpoint.exists() and not checkpoint.stat().st_size:  # nothing is learned yet
