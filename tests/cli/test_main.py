@@ -161,11 +161,7 @@ VIRTUAL = "drive --interface virtual --channel v"
         ("sweep --actuator m.npz --out s --num-starts 0", 2, "--num-starts: expected 1 or more"),
         ("evaluate --num-starts 0", 2, "--num-starts: expected 1 or more, got 0"),
         (f"{VIRTUAL} --valves v.json", 2, "--valves: expected --adapt or --shadow with it"),
-        (
-            f"{VIRTUAL} --adapt --controller jog --joint q1",
-            2,
-            "--adapt, --valves: expected a contr",
-        ),
+        (f"{VIRTUAL} --adapt --controller jog --joint q1", 2, "--adapt, --valves: expected a con"),
         ("machine --interface nonsense --channel 0", 1, "nonsense 0: expected a CAN bus, got"),
         (f"{VIRTUAL} --controller jog --joint q2", 2, "--joint: expected one of ['q1', 'q3',"),
         (f"{VIRTUAL} --controller jog --joint q1 --counts 81", 2, "--counts: expected 1 to 80"),
