@@ -229,7 +229,8 @@ def run(name: str, settings: dict[str, Any], clock: Clock) -> None:
     torch.set_num_threads(1)
     groups, options = name == "groups", clock.options
     recipe = find_recipe(critic=not groups)
-    rates = {"target_kl": PPOConfig.target_kl, **settings}  # for all the same
+    same = {"target_kl": PPOConfig.target_kl, "horizon": PPOConfig.horizon}
+    rates = {**same, **settings}  # for all the same
     config = replace(recipe.learner, total_steps=options.steps, **rates)
     env: Env = TaskVectorEnv(config.num_envs, clock.net, M, recipe.task, INTERFACE)
     if groups:
