@@ -9,13 +9,12 @@
 set -eu
 path=$(cd "$(dirname "$0")/.." && pwd)/docs/rectangle.csv
 bus="--interface udp_multicast --channel 239.74.163.2"
-run=${BROKK_MIN:-brokk-min}
 mkdir -p "$1" && cd "$1"
 
-$run collect --out log.npz --hours "${HOURS:-1}"
-$run fit log.npz --out net.npz --steps "${FIT_STEPS:-16000}"
-$run train --actuator net.npz --out policy.npz --total-steps "${TRAIN_STEPS:-400000}"
-$run evaluate --policy policy.npz --num-starts "${STARTS:-16}"
-$run machine $bus &
+brokk-min collect --out log.npz --hours "${HOURS:-1}"
+brokk-min fit log.npz --out net.npz --steps "${FIT_STEPS:-16000}"
+brokk-min train --actuator net.npz --out policy.npz --total-steps "${TRAIN_STEPS:-400000}"
+brokk-min evaluate --policy policy.npz --num-starts "${STARTS:-16}"
+brokk-min machine $bus &
 trap 'kill $!' EXIT
-$run drive --policy policy.npz $bus --command "${COMMANDS:-$path}" --log drive.log
+brokk-min drive --policy policy.npz $bus --command "${COMMANDS:-$path}" --log drive.log

@@ -19,7 +19,10 @@ def test_chain__goes_from_a_recording_to_a_drive(tmp_path, monkeypatch):
     """The tool is to stand still; on a loaded computer the drive may stop, because it is late."""
     own_multicast_port(monkeypatch)
     (tmp_path / "stand.csv").write_text("sequence,time,vx,vy,vz\nstand,0,0,0,0\nstand,1,0,0,0\n")
-    here = {"BROKK_MIN": f"{sys.executable} -m brokk_min", "COMMANDS": str(tmp_path / "stand.csv")}
+    command = tmp_path / "brokk-min"  # the package of this folder, whatever is installed
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m brokk_min "$@"\n')
+    command.chmod(0o755)
+    here = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "COMMANDS": str(tmp_path / "stand.csv")}
     here |= {"PYTHONPATH": str(SCRIPT.parents[1])}
     done = subprocess.run(
         ["sh", SCRIPT, tmp_path / "new"],

@@ -62,7 +62,7 @@ def test_evaluate__takes_the_packages_pids_where_a_policy_has_none(folder, monke
     (folder / "gains.json").unlink()
     shipped = SHIPPED / BROKK_170.name
     assert evaluate(folder, f"--json {folder}/own.json") == 0
-    policy = f"--policy {shipped}/policy.npz"
+    policy = f"--policy '{shipped}/policy.npz'"
     assert evaluate(folder, f"--json {folder}/package.json {policy}") == 0
     own, package = (json.loads((folder / f"{n}.json").read_text()) for n in ("own", "package"))
     assert own["meta"]["gains"] == package["meta"]["gains"] == str(shipped / "gains.json")
