@@ -4,7 +4,7 @@
     python -m benchmarks.deviations --train
 
 Each function returns the figures of one entry of docs/deviations.md, and the name of an entry
-prints that entry alone. D5 and D7 train policies, for some five minutes. `benchmarks.ladder` has
+prints that entry alone. D4 and D5 train policies, for some five minutes. `benchmarks.ladder` has
 what the parts of our agent are worth in other learners.
 """
 
@@ -39,7 +39,7 @@ M = BROKK_170
 LOW = M.column("q_min")
 HIGH = M.column("q_max")
 STEPS = 2_000_000  # of each training here
-WORLDS, WINDOWS = 256, 8  # of D10: machines, and windows before the one that is measured
+WORLDS, WINDOWS = 256, 8  # of D8: machines, and windows before the one that is measured
 NETS_OF = ("policy.npz", "policy_critic.npz")  # shipped policies that learned on both nets
 Figures = dict[str, float]
 
@@ -81,7 +81,7 @@ def d3() -> Figures:
     return {"one tick": np.std(np.diff(q) * M.rate), "4 samples": np.std(slopes)}
 
 
-def d9() -> Figures:
+def d7() -> Figures:
     """Error [m/s] of the optimised PID on plant and nets; median gap [m] of nets after 30 s."""
     ours, printed = (policy.load_policy(POLICY.with_name(name), M).net for name in NETS_OF)
     pid = read_gains(POLICY.with_name("gains.json"), M, ours)[OPTIMISED]
@@ -95,7 +95,7 @@ def d9() -> Figures:
     return errors
 
 
-def d10() -> Figures:
+def d8() -> Figures:
     """Weight that windows cut; part of the variance of A_t by groups due to the actions of t."""
     result = {}
     for name in ("policy.npz", "policy_paper.npz"):
@@ -180,7 +180,7 @@ def train() -> Figures:
 
 
 def trained() -> Figures:
-    """D5, D7: our agent, without the one and the other cost, and with the newest angles alone."""
+    """D4, D5: our agent, without the one and the other cost, and with the newest angles alone."""
     changes: dict[str, Any] = {"TRAVEL_COST": 0.0, "EFFORT_COST": 0.0}
     changes["smooth_angles"] = lambda _, history: history[..., 0, -1]
     result = {f"ours, {name}": value for name, value in train().items()}
@@ -190,7 +190,7 @@ def trained() -> Figures:
     return result
 
 
-MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d9, d10, levels)
+MEASURED: tuple[Callable[[], Figures], ...] = (a1, d1, d3, d7, d8, levels)
 
 
 def main(words: list[str]) -> None:

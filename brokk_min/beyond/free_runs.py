@@ -11,7 +11,7 @@ and the newest sample alone.
 
 What it buys: after 30 s under the same commands the tool of the nets is 0.016 m from the machine's,
 with richer logs and five nets a joint, and 0.11 m with the paper's nets (medians of 20 runs,
-`benchmarks.deviations d9`).
+`benchmarks.deviations d7`).
 
 Who was first: NARX models and their free runs are Leontaritis and Billings' (1985), the fit of a
 model on its own outputs is the output-error method (Ljung, System Identification, 1999).

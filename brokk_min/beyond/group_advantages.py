@@ -12,7 +12,7 @@ share a state in the first tick of a window alone: later A_t also credits an act
 earlier ones had brought its copy. The sum R stops where the goal changes and where the window ends:
 of the weight of the discount, 1 / (1 - gamma), a window cuts on average 68 % (12 ticks, gamma =
 0.94, ours) or 48 % (32 ticks, 0.95, with the paper's observation), and in its last ticks no valve
-answers before it ends. `benchmarks.deviations d10` measures what part of the variance of A_t is
+answers before it ends. `benchmarks.deviations d8` measures what part of the variance of A_t is
 due to a_t. Then all four go on as one of them.
 
 What it buys: after 30 million steps with the paper's observation on one net a joint (seed 0) the

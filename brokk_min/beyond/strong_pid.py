@@ -4,7 +4,7 @@ What it changes: it adds to each valve of `jacobian.JacobianController` the comm
 say would hold the wanted velocity (feed-forward), feeds back the integral of the tool's velocity
 error, opens a valve wider that has just been closed, and closes all valves while the tool rests. So
 it has the main inputs and tricks of our agent, but for the time of the Jacobian in the integral,
-which does not help it, and it opens valves wider from their first command on (D13, D12 in
+which does not help it, and it opens valves wider from their first command on (D11, D10 in
 docs/deviations.md).
 
 What it buys: with gains by the same optimiser its mean velocity error along x, y and z is 0.0113
