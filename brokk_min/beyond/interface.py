@@ -10,10 +10,10 @@ three seeds along x, y and z, `benchmarks.ladder`):
 
 | Parts | Velocity error | Drift | Valve travel |
 |---|---|---|---|
-| the paper's interface | 0.0327 m/s | 0.185 m | 28 |
-| the observation, too | 0.0176 m/s | 0.057 m | 56 |
-| actions beyond the dead zone, wider at starts, closed valves, too | 0.0149 m/s | 0.030 m | 94 |
-| costs, too | 0.0142 m/s | 0.015 m | 25 |
+| the paper's interface | 0.0327 m/s | 0.192 m | 28 |
+| the observation, too | 0.0177 m/s | 0.054 m | 50 |
+| actions beyond the dead zone, wider at starts, closed valves, too | 0.0148 m/s | 0.029 m | 82 |
+| costs, too | 0.0144 m/s | 0.013 m | 26 |
 
 Who was first: resolved rates (Whitney, 1969) as inputs are residual or "structured" observations of
 many papers; the integral is that of a PI controller; legged_gym has costs of torques and of action
