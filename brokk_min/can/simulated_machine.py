@@ -23,20 +23,19 @@ Outgoing = list[tuple[int, bytes]]  # identifiers and data
 class SimulatedMachine:
     """CiA 406 encoders, a valve controller by the rules of docs/hardware.md, and a plant.
 
-    It starts at angles `q` [rad] (n,) at the time `now` [s]. A plant makes a step every `period`
-    [s]; one whose step is a tick makes it with the SYNC, so that a command holds from one to the
-    next. ValueError: see `canopen.check_bus`.
+    It starts at angles `q` [rad] (n,) at the time `now` [s]. The analytic plant makes a
+    step every `STEP`; another one makes it once a tick, with the SYNC, so that a command holds from
+    one to the next. ValueError: see `canopen.check_bus`.
     """
 
-    def __init__(
-        self, machine: Machine, q: ArrayLike, now: float, plant: Plant = PLANT, period: float = STEP
-    ) -> None:
+    def __init__(self, machine: Machine, q: ArrayLike, now: float, plant: Plant = PLANT) -> None:
         canopen.check_bus(machine)
-        self.machine, self.plant, self.period = machine, plant, period
-        self.stepped = replace(machine, rate=1 / period)  # of which a tick is one step
+        self.machine, self.plant = machine, plant
+        self.period = STEP if isinstance(plant, AnalyticPlant) else machine.dt  # s, of its steps
+        self.stepped = replace(machine, rate=1 / self.period)  # of which a tick is one step
         self.state = plant.reset(self.stepped, np.array(q, float))
         self.start = now
-        self.moves = now + period  # time of the plant's next step
+        self.moves = now + self.period  # time of the plant's next step
         self.steps = self.heartbeats = 0
         *self.encoders, self.controller = canopen.node_numbers(machine)
         self.nmt = dict.fromkeys([*self.encoders, self.controller], PRE_OPERATIONAL)
@@ -178,9 +177,7 @@ class FaultyMachine(SimulatedMachine):
         plant: Plant = PLANT,
         faults: Sequence[Fault] = (),
     ) -> None:
-        super().__init__(
-            machine, q, now, plant, STEP if isinstance(plant, AnalyticPlant) else machine.dt
-        )
+        super().__init__(machine, q, now, plant)
         self.faults = [*faults]
         self.last: dict[int, bytes] = {}  # sound data of each node
         self.frames = dict.fromkeys(self.nmt, 0)  # of each node, so far

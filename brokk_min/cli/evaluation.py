@@ -37,9 +37,10 @@ class Evaluate(Command):
         elsewhere = gains and gains.parent != path.parent and self.plant != "analytic"
         gains = None if self.save_gains or elsewhere else gains
         self.writes(self.json, self.save_gains, reads=[path, gains])
-        files = {"rl": path.name} if self.policy else POLICIES
-        policies = {k: load_policy(path.with_name(f), machine) for k, f in files.items()}
-        net = policies["rl"].net
+        files = [path] if self.policy else [path.with_name(file) for file in POLICIES.values()]
+        loaded = [load_policy(file, machine) for file in files]
+        names = [loaded[0].name] if self.policy else [*POLICIES]
+        policies, net = dict(zip(names, loaded, strict=True)), loaded[0].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
         commands, starts = self.task(machine)
         controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}

@@ -14,7 +14,7 @@ from brokk_min.evaluation import metrics, progress, sequences
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import load_policy
 from brokk_min.learning.recipes import Recipe, find_recipe
-from brokk_min.machine import BROKK_170, Machine
+from brokk_min.machine import BROKK_170, Controller, Machine
 from brokk_min.settings import PPOConfig, TaskConfig
 
 FIRST_STEPS = 400_000  # of our agent, of the five million of its recipe
@@ -96,8 +96,8 @@ class Train(Training):
         if machine == BROKK_170:
             commands = sequences.axis_sequences(machine)
             starts = sequences.evaluation_starts(machine, STARTS, commands, 0)
-            name = "rl_paper" if self.paper else "rl"
-            runs, _ = metrics.evaluate(machine, {name: policy, **pids}, commands, starts, self.seed)
+            rivals: dict[str, Controller] = {policy.name: policy, **pids}
+            runs, _ = metrics.evaluate(machine, rivals, commands, starts, self.seed)
             print(table(runs))
         print(f"{self.out}: trained; curve in {self.out}.csv; `brokk-min play --policy {self.out}`")
 

@@ -23,8 +23,8 @@ SETTINGS = {
     "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
 }
 LOCAL = {"threads_per_worker": 1, "memory_limit": None, "silence_logs": "CRITICAL"}
-PATIENCE = 30  # s until a worker is there
 LOCAL |= {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}  # no other computer reaches it
+PATIENCE = 30  # s until a worker is there
 
 
 def side_by_side(

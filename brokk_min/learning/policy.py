@@ -45,6 +45,13 @@ class Policy:
             x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))  # ELU
         return np.asarray(x @ w_out + b_out)
 
+    @property
+    def name(self) -> str:
+        """Its name in tables, by its interface and its learner: see `evaluation.rollout.TITLES`."""
+        if self.interface == "beyond":
+            return "rl"
+        return "rl_critic_nets" if self.training.get("recipe", {}).get("critic") else "rl_paper"
+
     def start(self, num: int) -> None:
         """The agent remembers nothing yet."""
 

@@ -1,6 +1,7 @@
 """The simulated machine frame by frame on a clock of its own."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +17,8 @@ CONTROLLER = 16
 class Machine(SimulatedMachine):
     """It begins at 100 s."""
 
-    def __init__(self, *period):
-        super().__init__(BROKK_170, START, 100.0, Recorder(), *period)
+    def __init__(self, plant=None):
+        super().__init__(BROKK_170, START, 100.0, plant or Recorder())
 
     def take(self, can_id, data=b"", now=100.0):
         return self.receive(Frame(now, can_id, data))
@@ -55,16 +56,17 @@ def test_advance__moves_and_beats_by_its_own_clock():
 
 def test_advance__moves_a_plant_of_ones_own_once_a_tick_by_the_command_that_held():
     """With each SYNC, which may be 2 ms early or late; without, by its own clock."""
-    machine = Machine(0.05)
+    recorder = Recorder()
+    machine = Machine(SimpleNamespace(reset=recorder.reset, step=recorder.step))
     assert machine.stepped.dt == 0.05
     machine.take(0x000, b"\1\0")
     for k, late in enumerate((0.0, -0.002, 0.002, 0.0, 0.002)):
         now = 100.02 + 0.05 * k + late
         machine.advance(now)
         machine.valves(k, 10 * k, now=now)
-    assert np.rint(127 * np.array(machine.plant.u))[:, 0].tolist() == [0, 10, 20, 30]
+    assert np.rint(127 * np.array(recorder.u))[:, 0].tolist() == [0, 10, 20, 30]
     machine.advance(100.4)
-    assert len(machine.plant.u) == 4 + 3
+    assert len(recorder.u) == 4 + 3
 
 
 def test_receive__opens_valves_after_a_start_and_a_neutral_frame():

@@ -28,7 +28,7 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
         assert evaluate(folder, f"--plant {plant} --json {out} --force") == 0
         meta, runs = json.loads(out.read_text()).values()
         assert (used | {"plant": plant, "machine": "brokk170"}).items() <= meta.items()
-        assert [row["controller"] for row in runs] == ["rl", *pids(BROKK_170, NET)]
+        assert [row["controller"] for row in runs] == ["rl_paper", *pids(BROKK_170, NET)]
         labels = {(row["sequence"], row["start"], row["kind"]) for row in runs}
         assert labels == {("up", 0, "file")}
         errors.append(tuple(row["velocity_error_mean"] for row in runs))
@@ -91,6 +91,6 @@ def test_evaluate__adapts_each_controller_cold_and_warm(folder, capsys, monkeypa
     monkeypatch.setattr(adaptive, "PARTS", 1)
     assert evaluate(folder, "--adapt") == 0
     printed = capsys.readouterr().out
-    for name in ("rl", *pids(BROKK_170, NET)):
+    for name in ("rl_paper", *pids(BROKK_170, NET)):
         assert f"\n{TITLES[name]}, adaptive " in printed
         assert f"\n{TITLES[name]}, adaptive, warm " in printed

@@ -48,7 +48,8 @@ def test_train__has_its_settings_from_the_line(
     assert re.search(r"^128 steps: 0\.\d{4} m/s; the PID tuned by hand has 0\.", printed, re.M)
     errors = dict(re.findall(r"^(P.*\w|s.*\w) +(?:open|closed) +(\S+)", printed, re.M))
     assert float(errors["PID optimised"]) < float(errors["PID by hand"]) < 0.06
-    assert float(errors[title("rl" if interface == "beyond" else "rl_paper")]) > 0.06
+    paper = "rl_critic_nets" if "--critic" in options else "rl_paper"
+    assert float(errors[title("rl" if interface == "beyond" else paper)]) > 0.06
     assert run(f"train {SMALL} {options}") == 2  # it is there
     policy = load_policy(tmp_path / "policy.npz", BROKK_170)
     shipped = load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170).net
