@@ -18,7 +18,7 @@ from brokk_min.evaluation.preliminary import Gap, Tests, response_time
 from brokk_min.evaluation.rollout import TITLES
 
 TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-JUDGED = ("rl_critic", "rl_critic_nets", "rl_paper")  # the paper's learner, and groups
+JUDGED = ("rl_critic", "rl_paper")  # the paper's learner, and groups
 PIDS = (RAW, BY_HAND, OPTIMISED)  # with the paper's structure, by hand first
 ERROR, DRIFT = "velocity_error_mean", "off_axis_drift_max"
 SHORT = {ERROR: "error", DRIFT: "drift"}  # in columns

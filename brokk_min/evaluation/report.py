@@ -28,7 +28,7 @@ from brokk_min.machine import Array, Machine
 Results = Mapping[str, Any]  # of `results.json`
 Row = tuple[Sequence[str], Mapping[str, Array]]  # of plots: labels, and curves (T, labels) by name
 Shown = tuple[Mapping[str, Tests], Gap, Traces]  # of machine and nets, nets less machine
-ROWS = (BY_HAND, OPTIMISED, "rl_critic", "rl_critic_nets", "rl_paper", "rl", STRONGEST)
+ROWS = (BY_HAND, OPTIMISED, "rl_critic", "rl_paper", "rl", STRONGEST)
 SAMPLE = ("rl_paper", "rl_critic", BY_HAND, OPTIMISED)  # drawn in Fig. 6
 WIDTH = 10.0  # inch, of every figure, so that letters have one size in the report
 LINES = ("-", "--", "-.", ":")  # beside colours, for the colour-blind

@@ -32,11 +32,9 @@ from brokk_min.machine import Array, Machine
 from brokk_min.settings import TaskConfig
 
 # beyond the chain's: sixth in error of the seeds 0 to 9, of `rl_critic` third of 0 to 3
-SEEDS = {"rl": 8, "rl_paper": 5, "rl_critic": 3, "rl_critic_nets": 0}  # the last not chosen
-TRAINED = POLICIES | {"rl_critic_nets": "policy_critic_nets.npz"}  # for the tables alone
-CRITIC_STEPS = 60_000_000  # of the paper's learner on our nets
+SEEDS = {"rl": 8, "rl_paper": 5, "rl_critic": 3}
 PAIRS = (  # of a policy and a PID, that the pages compare
-    ("rl_critic_nets", baselines.OPTIMISED),
+    ("rl_critic", baselines.BY_HAND),
     ("rl_paper", baselines.BY_HAND),
     ("rl_paper", baselines.OPTIMISED),
     ("rl", baselines.STRONGEST),
@@ -103,20 +101,17 @@ def fit_net(chain: Chain, name: str, log: Log, recipe: Mapping[str, Any]) -> Act
 
 
 def recipe_of(name: str) -> Recipe:
-    """The recipe of one of `TRAINED`."""
-    recipe = find_recipe(paper=name != "rl", critic=name.startswith("rl_critic"))
-    if name == "rl_critic_nets":
-        return replace(recipe, learner=replace(recipe.learner, total_steps=CRITIC_STEPS))
-    return recipe
+    """The recipe of one of `POLICIES`."""
+    return find_recipe(paper=name != "rl", critic=name == "rl_critic")
 
 
 def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
-    """One of `TRAINED`, by its own recipe."""
+    """One of `POLICIES`, by its own recipe."""
     recipe = recipe_of(name)
     steps = chain.budget.train_steps or recipe.learner.total_steps
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=steps))
     driven, seed = select_nets(chain.machine, net), chain.seed + SEEDS[name]
-    return train_policy(chain.machine, driven, recipe, seed, chain.out / TRAINED[name])
+    return train_policy(chain.machine, driven, recipe, seed, chain.out / POLICIES[name])
 
 
 def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
@@ -125,13 +120,12 @@ def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
     jobs: dict[str, Callable[..., Any]] = {
         "net": partial(fit_net, chain, "net", log, {}),
         "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
-        "rl_critic_nets": partial(train_one, chain, "rl_critic_nets"),  # the longest first
-        "rl_paper": partial(train_one, chain, "rl_paper"),
+        "rl_paper": partial(train_one, chain, "rl_paper"),  # the longest first
         "rl_critic": partial(train_one, chain, "rl_critic"),
         "rl": partial(train_one, chain, "rl"),
         "pids": partial(tune, effort=chain.budget.tuning, seed=chain.seed),
     }
-    needs = {name: ["net"] for name in (*TRAINED, "pids")} | {"rl_critic": ["net_paper"]}
+    needs = {name: ["net"] for name in (*POLICIES, "pids")} | {"rl_critic": ["net_paper"]}
     return side_by_side(jobs, needs)
 
 
@@ -139,12 +133,13 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
     """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
     net = select_nets(machine, done["net"])
-    controllers = {name: done[name] for name in TRAINED} | done["pids"]
+    controllers = {name: done[name] for name in POLICIES} | done["pids"]
     commands = sequences.task_sequences(machine)
     starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
     write_csv(chain.out / "starts.csv", machine.names, starts.tolist())
     ticks = round(budget.short_s * machine.rate)
     short = [axis._replace(goals=axis.goals[:ticks]) for axis in commands[:3]]
+    varied = side_by_side(robustness(machine, controllers, net, short, starts[:16], seed))
     plants: dict[str, Plant] = {"machine": PLANT, "nets": net}
     tests = {kind: preliminary.preliminary_tests(machine, of) for kind, of in plants.items()}
     gap = preliminary.sim_to_real(machine, plants, seed)
@@ -153,7 +148,7 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, net)
     meta |= {"effort": asdict(budget)}
     baselines.write_gains(chain.out / "gains.json", done["pids"], meta)
-    files = [*TRAINED.values(), "gains.json"]
+    files = [*POLICIES.values(), "gains.json"]
     results = {
         "meta": meta | {"files": {file: digest(chain.out / file) for file in files}},
         "table": {name: of["all"] for name, of in along.items()},
@@ -161,7 +156,7 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
         "pairs": compare_pairs(runs),
         "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
         "trainings": trainings(budget, runs),
-        "robustness": mean_errors(robustness(machine, controllers, net, short, starts[:16], seed)),
+        "robustness": mean_errors(varied),
         "starts": starts.tolist(),
     }
     return results, (tests, gap, traces)
@@ -184,7 +179,7 @@ def trainings(budget: Budget, runs: Sequence[metrics.Run]) -> list[str]:
         return float(metrics.by_start(runs, name, "all", "velocity_error_mean").mean())
 
     lines = []
-    for name in TRAINED:
+    for name in POLICIES:
         whole = recipe_of(name).learner.total_steps
         if steps := budget.train_steps:
             better = error(name) < error(baselines.BY_HAND)
@@ -220,8 +215,8 @@ def robustness(
     commands: Sequence[sequences.Commands],
     starts: Array,
     seed: int,
-) -> dict[str, metrics.Table]:
-    """Runs on each of the `variations`, with faster goals and other noise. Paper: Sec. 4.2
+) -> dict[str, Callable[[], metrics.Table]]:
+    """Calls that drive each of the `variations`, faster goals, other noise. Paper: Sec. 4.2
 
     Each controller is also there cold and warm, as it learns its valves by `beyond.adaptation`.
     """
@@ -233,14 +228,15 @@ def robustness(
     cases["twice the sensor noise"] = machine, commands, 2 * usual
     rows, longest = len(commands) * len(starts), max(len(one.goals) for one in commands)
     motions = adaptive.warm_up_motions(machine, min(adaptive.SECONDS, longest * machine.dt))
-    result: dict[str, metrics.Table] = {}
-    for name, (varied, moves, noise) in cases.items():
+
+    def score(varied: Machine, moves: Sequence[sequences.Commands], noise: float) -> metrics.Table:
         learners = adaptive.cold_and_warm(
             controllers, net, machine, varied, rows, motions, noise=noise
         )
         every = {**controllers, **learners}
-        result[name], _ = metrics.evaluate(varied, every, moves, starts, seed, noise=noise)
-    return result
+        return metrics.evaluate(varied, every, moves, starts, seed, noise=noise)[0]
+
+    return {name: partial(score, *case) for name, case in cases.items()}
 
 
 def mean_errors(cases: Mapping[str, metrics.Table]) -> dict[str, dict[str, metrics.Mean]]:

@@ -90,7 +90,8 @@ def vary(
         controllers: dict[str, Controller] = {**read_gains(file, machine, net)}
     else:
         controllers = {"rl" if name.startswith("seed") else name: load_policy(file, machine)}
-    return robustness(machine, controllers, net, sequences, poses, 0)
+    drives = robustness(machine, controllers, net, sequences, poses, 0)
+    return {case: drive() for case, drive in drives.items()}
 
 
 def pool(
