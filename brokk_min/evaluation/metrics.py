@@ -154,9 +154,8 @@ def by_start(runs: Sequence[Run], controller: str, sequence: str, key: str) -> A
 def mean_interval(values: Array) -> Mean:
     """Mean, and its 95 % confidence interval by Student's t; None for what too few values have.
 
-    Example:
-        >>> {key: round(x, 3) for key, x in mean_interval(np.array([1.0, 2.0, 3.0])).items()}
-        {'mean': 2.0, 'low': -0.484, 'high': 4.484}
+    >>> {key: round(x, 3) for key, x in mean_interval(np.array([1.0, 2.0, 3.0])).items()}
+    {'mean': 2.0, 'low': -0.484, 'high': 4.484}
     """
     from scipy.special import stdtrit  # Student's t quantile; slow to import
 
@@ -170,9 +169,8 @@ def mean_interval(values: Array) -> Mean:
 def interval_text(number: Mean) -> str:
     """A mean with its interval, if it was measured and has one.
 
-    Example:
-        >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
-        '0.0123 (-0.5000 to 41.27)'
+    >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
+    '0.0123 (-0.5000 to 41.27)'
     """
     texts = [f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in number.values() if x is not None]
     texts = texts or ["not measured"]
