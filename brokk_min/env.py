@@ -322,6 +322,7 @@ class Episodes(NamedTuple):
 
 
 Draw = Callable[[Machine, TaskConfig, Rng, int], NDArray[Any]]
+Outcome = tuple[Episodes, Array, Bools, Bools, dict[str, Any]]  # of a `tick`
 
 
 @dataclass(frozen=True)
@@ -377,9 +378,7 @@ def new_goals(task: Task, rng: Rng, state: State) -> State:
     return state._replace(v_goal=v_goal, goal_ticks=goal_ticks)
 
 
-def tick(
-    task: Task, rng: Rng, before: Episodes, actions: Array
-) -> tuple[Episodes, Array, Bools, Bools, dict[str, Any]]:
+def tick(task: Task, rng: Rng, before: Episodes, actions: Array) -> Outcome:
     """One tick under actions (num, n_driven); episodes that end are not begun anew.
 
     Returns the next episodes; reward, terminated, truncated (num,); and the velocity error [m/s]
@@ -396,9 +395,7 @@ def tick(
     return after, np.where(end, 0.0, earned), end, truncated, info
 
 
-def step(
-    task: Task, rng: Rng, before: Episodes, actions: Array
-) -> tuple[Episodes, Array, Bools, Bools, dict[str, Any]]:
+def step(task: Task, rng: Rng, before: Episodes, actions: Array) -> Outcome:
     """A `tick`, then new episodes where some have ended: same-step resets. Paper: Fig. 4
 
     Their own last observations are in the dictionary as `final_obs`.

@@ -2,11 +2,6 @@
 
 One forward kinematics gives the frames of a pose; all else is worked out from these frames. The
 base frame has z up; its origin lies on the first axis, for the Brokk at ground level. Paper: Fig. 1
-
->>> frames = forward_kinematics(BROKK_170, [1.5, 0.5, 0.58, 1.71, 1.24])
->>> x, y, z = tool_position(frames)
->>> round(float(np.hypot(x, y)), 2), round(float(z), 2)
-(3.05, 1.01)
 """
 
 import math

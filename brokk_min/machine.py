@@ -34,15 +34,13 @@ def python_numbers(value: Any, place: str = "") -> None:
     """
     for field in fields(value):
         found = getattr(value, field.name)
-        plain = found.tolist() if isinstance(found, np.generic | np.ndarray) else found
-        if isinstance(plain, list | tuple):
-            plain = tuple(x.item() if isinstance(x, np.generic) else x for x in plain)
-        if field.type in (int, float):
-            kinds = int if field.type is int else int | float
-            wanted = "a whole number" if field.type is int else "a finite number"
-            fits = isinstance(plain, kinds) and bool(np.isfinite(plain))
-            require(fits, place + field.name, wanted, found)
-        object.__setattr__(value, field.name, plain)
+        plain = np.asarray(found).tolist()
+        if field.type is int:
+            require(isinstance(plain, int), place + field.name, "a whole number", found)
+        if field.type is float:
+            finite = isinstance(plain, int | float) and bool(np.isfinite(plain))
+            require(finite, place + field.name, "a finite number", found)
+        object.__setattr__(value, field.name, tuple(plain) if isinstance(plain, list) else plain)
 
 
 @dataclass(frozen=True)
@@ -151,9 +149,8 @@ class Machine:
         for j in self.joints:
             pair = np.shape(j.dead_zone) == (2,)
             require(pair, f"{j.name}.dead_zone", "a pair, up and down", j.dead_zone)
-            for name in ("q_dot_up", "q_dot_down"):
-                speed = getattr(j, name)
-                require(speed > 0, f"{j.name}.{name}", "a positive number", speed)
+            slower = min(j.q_dot_up, j.q_dot_down)
+            require(slower > 0, f"{j.name}.q_dot_up, q_dot_down", "positive numbers", slower)
             known = j.kind in ("revolute", "prismatic")
             require(known, f"{j.name}.kind", "revolute or prismatic", j.kind)
             require(j.q_min < j.q_max, f"{j.name}.q_max", f"above {j.q_min}", j.q_max)

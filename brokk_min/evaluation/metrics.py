@@ -152,11 +152,7 @@ def by_start(runs: Sequence[Run], controller: str, sequence: str, key: str) -> A
 
 
 def mean_interval(values: Array) -> Mean:
-    """Mean, and its 95 % confidence interval by Student's t; None for what too few values have.
-
-    >>> {key: round(x, 3) for key, x in mean_interval(np.array([1.0, 2.0, 3.0])).items()}
-    {'mean': 2.0, 'low': -0.484, 'high': 4.484}
-    """
+    """Mean, and its 95 % confidence interval by Student's t; None for what too few values have."""
     from scipy.special import stdtrit  # Student's t quantile; slow to import
 
     mean = float(values.mean()) if len(values) else None
@@ -205,8 +201,6 @@ def compare(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, di
         row: dict[str, Any] = dict(mean_interval(100 * (mine - its) / whole))
         parts = [sequence] if sequence != "all" else column(runs, "sequence")
         won = [by_start(runs, one, of, key) < by_start(runs, other, of, key) for of in parts]
-        result[sequence] = row | {
-            "won": sum(of.sum().item() for of in won),
-            "runs": sum(map(len, won)),
-        }
+        row |= {"won": sum(of.sum().item() for of in won), "runs": sum(map(len, won))}
+        result[sequence] = row
     return result
