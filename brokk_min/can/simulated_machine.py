@@ -218,24 +218,20 @@ class FaultyMachine(SimulatedMachine):
         """What comes of a frame of a node: nothing, or its data, perhaps changed."""
         kind, seconds = self._fault(node, now)
         self.frames[node] += 1
-        match kind:
-            case "off":
-                return []
-            case "stuck":
-                return [self.last.get(node, data)]
-            case "garbage":
-                return [self.rng.bytes(len(data))]
-            case "wrong":
-                return [bytes([data[0] ^ 0x40, *data[1:]])]
-            case "slow":
-                return [data] * (self.frames[node] % 2)
-            case "delayed":
-                self.late.append((now + DELAY, node, data))
-                return []
-            case "intermittent":
-                return [data] * int(seconds // PAUSE % 2)
-        self.last[node] = data
-        return [data]
+        if kind == "ok":
+            self.last[node] = data
+        if kind == "delayed":
+            self.late.append((now + DELAY, node, data))
+        return {
+            "ok": [data],
+            "off": [],
+            "delayed": [],
+            "stuck": [self.last.get(node, data)],
+            "garbage": [self.rng.bytes(len(data))],
+            "wrong": [bytes([data[0] ^ 0x40, *data[1:]])],
+            "slow": [data] * (self.frames[node] % 2),
+            "intermittent": [data] * int(seconds // PAUSE % 2),
+        }[kind]
 
 
 def start_pose(machine: Machine) -> Array:

@@ -51,8 +51,8 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         if max_episode_steps is not None:
             require(max_episode_steps > 0, "max_episode_steps", "1 or more", max_episode_steps)
             config = replace(config, episode_s=max_episode_steps / machine.rate)
-        self.metadata = TaskEnv.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.metadata["render_fps"] = round(machine.rate)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(machine.rate)}
+        self.metadata |= {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.num_envs, self.render_mode = num_envs, render_mode
         self.task = env.Task(machine, plant, config, interface)
         mean, _ = interface.scale(machine)
