@@ -56,6 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
             default=COMMANDS[name].defaults(options),
             config=(tyro.conf.FlagCreatePairsOff,),
         )
+        command.check_numbers()
         command(command.find_machine())
         sys.stdout.flush()
     except BrokenPipeError:  # as of `| head`, which has seen enough

@@ -78,10 +78,8 @@ def hydraulics_of(machine: Machine) -> Hydraulics:
     ValueError: no such name, a cylinder of no joint, no pair of speeds, a triangle that does not
     close, or a step that Euler cannot take.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> hydraulics_of(BROKK_170).pump_flow
-        0.00105
+    >>> hydraulics_of(BROKK_170).pump_flow
+    0.00105
     """
     h = machine.hydraulics or Hydraulics()
     if isinstance(h, str):
@@ -109,10 +107,8 @@ def hydraulics_of(machine: Machine) -> Hydraulics:
 def cylinder_column(machine: Machine, name: str) -> Array:
     """One number of the cylinders of all joints, (n,); read-only.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> cylinder_column(BROKK_170, "rod").tolist()
-        [0.15, 0.35, 0.3, 0.25, 0.2]
+    >>> cylinder_column(BROKK_170, "rod").tolist()
+    [0.15, 0.35, 0.3, 0.25, 0.2]
     """
     of = hydraulics_of(machine).cylinders
     column = np.array([getattr(of.get(j, Cylinder()), name) for j in machine.names], float)
@@ -126,10 +122,8 @@ def cylinder_speeds(machine: Machine) -> Array:
 
     Where none is given, the joint has q_dot_up or q_dot_down with the longest lever arm, `rod`.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> cylinder_speeds(BROKK_170)[4].tolist()
-        [0.0425, 0.0833]
+    >>> cylinder_speeds(BROKK_170)[4].tolist()
+    [0.0425, 0.0833]
     """
     h = hydraulics_of(machine)
     rods = cylinder_column(machine, "rod")[:, None]
@@ -186,10 +180,8 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
 
     r = a b sin(gamma) / sqrt(a^2 + b^2 - 2 a b cos(gamma)), gamma = gamma_0 + q.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> lever_arm(BROKK_170, [0.0, 0.5, 0.5, 1.7, 1.0]).round(3)
-        array([0.15 , 0.337, 0.299, 0.247, 0.197])
+    >>> lever_arm(BROKK_170, [0.0, 0.5, 0.5, 1.7, 1.0]).round(3)
+    array([0.15 , 0.337, 0.299, 0.247, 0.197])
     """
     a, b = cylinder_column(machine, "base"), cylinder_column(machine, "rod")
     gamma = cylinder_column(machine, "angle") + np.asarray(q)
@@ -200,11 +192,9 @@ def lever_arm(machine: Machine, q: ArrayLike) -> Array:
 def euler_step(machine: Machine, state: PlantState, opening: Array) -> PlantState:
     """Spool, valve activation, cylinder speed and angle, `Hydraulics.dt` later.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> state = PLANT.reset(BROKK_170, BROKK_170.q_start)
-        >>> euler_step(BROKK_170, state, np.ones(5)).s.round(3).tolist()  # dt / tau_s
-        [0.167, 0.167, 0.167, 0.167, 0.167]
+    >>> state = PLANT.reset(BROKK_170, BROKK_170.q_start)
+    >>> euler_step(BROKK_170, state, np.ones(5)).s.round(3).tolist()  # dt / tau_s
+    [0.167, 0.167, 0.167, 0.167, 0.167]
     """
     m, h = machine, hydraulics_of(machine)
     dt = h.dt
@@ -238,9 +228,8 @@ def initial_history(q: ArrayLike, samples: int) -> Array:
     Rows: angle [rad], velocity [rad/s], command [-1, 1]; newest sample last. A command is held from
     one angle to the next, so beside q(t-12) ... q(t) stand u(t-13) ... u(t-1). Paper: Table 1
 
-    Example:
-        >>> initial_history(np.zeros((256, 4)), 13).shape
-        (256, 4, 3, 13)
+    >>> initial_history(np.zeros((256, 4)), 13).shape
+    (256, 4, 3, 13)
     """
     q = 1.0 * np.asarray(q)  # whole numbers become floats
     history = np.zeros((*q.shape, 3, samples), q.dtype)
@@ -253,10 +242,9 @@ def append_command(history: Array, u: ArrayLike) -> Array:
 
     `u` (..., n) is the command of the coming tick. Paper: Table 1
 
-    Example:
-        >>> history = append_command(initial_history([0.5], 3), [1.0])
-        >>> history[0, 2].tolist()
-        [0.0, 0.0, 1.0]
+    >>> history = append_command(initial_history([0.5], 3), [1.0])
+    >>> history[0, 2].tolist()
+    [0.0, 0.0, 1.0]
     """
     result = history.copy()
     result[..., 2, :-1] = history[..., 2, 1:]
@@ -269,10 +257,9 @@ def append_sample(history: Array, u: ArrayLike, q: Array, window: int, dt: float
 
     The velocity is the slope of the newest `window` angles.
 
-    Example:
-        >>> history = append_sample(initial_history([0.0], 3), [1.0], np.array([0.1]), 2, 0.05)
-        >>> history[0, :, -1].round(6).tolist()  # angle, velocity, command
-        [0.1, 2.0, 1.0]
+    >>> history = append_sample(initial_history([0.0], 3), [1.0], np.array([0.1]), 2, 0.05)
+    >>> history[0, :, -1].round(6).tolist()  # angle, velocity, command
+    [0.1, 2.0, 1.0]
     """
     result = np.empty(history.shape, history.dtype)
     result[..., :-1] = history[..., 1:]
@@ -288,9 +275,8 @@ def estimate_velocity(q: ArrayLike, samples: int, dt: float) -> Array:
     A difference over one tick of a 12-bit encoder comes in steps of 0.031 rad/s at 20 Hz; four
     samples have a third of its noise and are 1.5 ticks late.
 
-    Example:
-        >>> estimate_velocity([0.0, 0.1, 0.2, 0.3], 4, 0.05).round(6).tolist()
-        2.0
+    >>> estimate_velocity([0.0, 0.1, 0.2, 0.3], 4, 0.05).round(6).tolist()
+    2.0
     """
     q = 1.0 * np.asarray(q)  # whole numbers become floats
     t = dt * (np.arange(samples) - (samples - 1) / 2)

@@ -52,10 +52,8 @@ def velocity_deviations(machine: Machine) -> tuple[Array, Array]:
     the smallest that give the goal, pinv(J) v, cut at each joint's nominal speed, and at least 5 %
     of that speed.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> velocity_deviations(BROKK_170)[0].round(3).tolist()
-        [0.093, 0.093, 0.093]
+    >>> velocity_deviations(BROKK_170)[0].round(3).tolist()
+    [0.093, 0.093, 0.093]
     """
     rng = np.random.default_rng(0)
     q = rng.uniform(machine.column("q_min"), machine.column("q_max"), (DRAWS, machine.n))
@@ -81,10 +79,8 @@ class Scale(NamedTuple):
 def observation_table(machine: Machine) -> Scale:
     """The table above in numbers; angles are uniform over their range. Paper: Sec. 3.4
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> observation_table(BROKK_170).mean.shape
-        (163,)
+    >>> observation_table(BROKK_170).mean.shape
+    (163,)
     """
     H = machine.history
     q_mean = (machine.column("q_min") + machine.column("q_max")) / 2
@@ -109,11 +105,9 @@ def measure(
     samples of the history, old ones too. The tool's velocity has noise of its own beside that of
     the angles in J.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
-        >>> measure(BROKK_170, state.history, state.v_goal).history.shape  # of driven joints
-        (4, 3, 13)
+    >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
+    >>> measure(BROKK_170, state.history, state.v_goal).history.shape  # of driven joints
+    (4, 3, 13)
     """
     q = history[..., 0, -1].copy()
     driven = history.take(machine.driven, axis=-3)
@@ -131,11 +125,9 @@ def measure(
 def features(machine: Machine, measured: Measured) -> Array:
     """The observation of the table above. Paper: Sec. 3.4, Fig. 3
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
-        >>> features(BROKK_170, measure(BROKK_170, state.history, state.v_goal)).shape
-        (163,)
+    >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
+    >>> features(BROKK_170, measure(BROKK_170, state.history, state.v_goal)).shape
+    (163,)
     """
     shape = (*measured.q.shape[:-1], -1)
     angles_and_velocities = measured.history[..., :2, :].reshape(shape)
@@ -151,10 +143,8 @@ def action_to_pwm(machine: Machine, action: ArrayLike) -> Array:
 
     ValueError: a wrong shape, or a number that is not finite.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> action_to_pwm(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
-        array([ 80.,   0., -40.,   0.,  80.])
+    >>> action_to_pwm(BROKK_170, [1.0, -0.5, 0.0, 2.0]) * 127
+    array([ 80.,   0., -40.,   0.,  80.])
     """
     a = np.asarray(action)
     if a.shape[-1:] != machine.driven.shape or not np.isfinite(a).all():
@@ -213,10 +203,8 @@ class State(NamedTuple):
 def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: Plant = PLANT) -> State:
     """Machines at rest at angles `q` [rad] (..., n) with goals (..., 3) [m/s] that never change.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> initial_state(BROKK_170, np.zeros((256, 5)), [0.1, 0, 0]).v_goal.shape
-        (256, 3)
+    >>> initial_state(BROKK_170, np.zeros((256, 5)), [0.1, 0, 0]).v_goal.shape
+    (256, 3)
     """
     q = np.array(q, float)
     goal = np.broadcast_to(np.asarray(v_goal, np.float32), (*q.shape[:-1], 3))
@@ -237,11 +225,9 @@ def initial_state(machine: Machine, q: ArrayLike, v_goal: ArrayLike, plant: Plan
 def transition(machine: Machine, plant: Plant, state: State, u: Array) -> State:
     """One tick of the plant under the command `u` (..., n). Paper: Sec. 3.4
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
-        >>> float(transition(BROKK_170, PLANT, state, np.zeros(5)).v_tool.max())  # at rest
-        0.0
+    >>> state = initial_state(BROKK_170, BROKK_170.q_start, np.zeros(3))
+    >>> float(transition(BROKK_170, PLANT, state, np.zeros(5)).v_tool.max())  # at rest
+    0.0
     """
     after = plant.step(machine, state.plant, u)
     q = np.asarray(after.q, float)
@@ -263,9 +249,8 @@ def transition(machine: Machine, plant: Plant, state: State, u: Array) -> State:
 def reward(v_goal: Array, v_tool: Array) -> Array:
     """1 / (1 + |v_goal - v_tool|) (...) of velocities [m/s] (..., 3), in (0, 1]. Paper: eq2
 
-    Example:
-        >>> reward(np.array([0.2, 0.0, 0.0]), np.array([0.2, 0.0, 0.25])).tolist()
-        0.8
+    >>> reward(np.array([0.2, 0.0, 0.0]), np.array([0.2, 0.0, 0.25])).tolist()
+    0.8
     """
     return np.asarray(1 / (1 + np.linalg.norm(v_goal - v_tool, axis=-1)))
 
@@ -273,10 +258,8 @@ def reward(v_goal: Array, v_tool: Array) -> Array:
 def terminated(machine: Machine, lowest: Array) -> Bools:
     """Is a link in the ground? `lowest` [m] (...) is `kinematics.lowest_point`. Paper: Sec. 3.4
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> terminated(BROKK_170, np.array([0.1, -0.1])).tolist()
-        [False, True]
+    >>> terminated(BROKK_170, np.array([0.1, -0.1])).tolist()
+    [False, True]
     """
     return np.asarray(lowest < machine.ground)
 
@@ -287,10 +270,8 @@ def terminated(machine: Machine, lowest: Array) -> Bools:
 def draw_pose(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
     """Random angles within the joints' ranges [rad] (num, n); some have a link in the ground.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> draw_pose(BROKK_170, TaskConfig(), np.random.default_rng(0), 256).shape
-        (256, 5)
+    >>> draw_pose(BROKK_170, TaskConfig(), np.random.default_rng(0), 256).shape
+    (256, 5)
     """
     return rng.uniform(machine.column("q_min"), machine.column("q_max"), (num, machine.n))
 
@@ -298,11 +279,9 @@ def draw_pose(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array
 def draw_goal(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
     """Random tool velocities [m/s] (num, 3): zero, along an axis, or anywhere; up to tool_speed.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> goals = draw_goal(BROKK_170, TaskConfig(), np.random.default_rng(0), 256)
-        >>> bool(np.linalg.norm(goals, axis=-1).max() <= 0.3)
-        True
+    >>> goals = draw_goal(BROKK_170, TaskConfig(), np.random.default_rng(0), 256)
+    >>> bool(np.linalg.norm(goals, axis=-1).max() <= 0.3)
+    True
     """
     direction = rng.standard_normal((num, 3))
     kind = rng.random((num, 1))
@@ -315,11 +294,9 @@ def draw_goal(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array
 def draw_hold(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> NDArray[np.int64]:
     """Random numbers of ticks for which a goal holds, (num,).
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> hold = draw_hold(BROKK_170, TaskConfig(), np.random.default_rng(0), 256)
-        >>> bool((hold >= 40).all() and (hold <= 120).all())  # 2 to 6 s
-        True
+    >>> hold = draw_hold(BROKK_170, TaskConfig(), np.random.default_rng(0), 256)
+    >>> bool((hold >= 40).all() and (hold <= 120).all())  # 2 to 6 s
+    True
     """
     low = max(1, round(config.hold_min_s * machine.rate))
     high = max(1, round(config.hold_max_s * machine.rate))
@@ -329,10 +306,8 @@ def draw_hold(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> NDArr
 def draw_noise(machine: Machine, config: TaskConfig, rng: Rng, num: int) -> Array:
     """Uniform noise of `measure` [deviations], float32 (num, noisy). Paper: Sec. 3.4 (5 %)
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> draw_noise(BROKK_170, TaskConfig(), np.random.default_rng(0), 256).shape
-        (256, 108)
+    >>> draw_noise(BROKK_170, TaskConfig(), np.random.default_rng(0), 256).shape
+    (256, 108)
     """
     size = observation_table(machine).measured.sum()
     return np.float32(config.noise) * (2 * rng.random((num, size), np.float32) - 1)
@@ -347,6 +322,7 @@ class Episodes(NamedTuple):
 
 
 Draw = Callable[[Machine, TaskConfig, Rng, int], NDArray[Any]]
+Outcome = tuple[Episodes, Array, Bools, Bools, dict[str, Any]]  # of a `tick`
 
 
 @dataclass(frozen=True)
@@ -374,11 +350,9 @@ class Task:
 def reset(task: Task, rng: Rng, num: int) -> Episodes:
     """`num` machines at rest in random poses, with random goals. Paper: Sec. 3.4
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> task = Task(BROKK_170, PLANT, TaskConfig(), PAPER)
-        >>> reset(task, np.random.default_rng(0), 256).obs.shape
-        (256, 163)
+    >>> task = Task(BROKK_170, PLANT, TaskConfig(), PAPER)
+    >>> reset(task, np.random.default_rng(0), 256).obs.shape
+    (256, 163)
     """
     pose, goal, hold = (task.draw(what, rng, num) for what in (draw_pose, draw_goal, draw_hold))
     state = initial_state(task.machine, pose, goal, task.plant)._replace(goal_ticks=hold)
@@ -404,9 +378,7 @@ def new_goals(task: Task, rng: Rng, state: State) -> State:
     return state._replace(v_goal=v_goal, goal_ticks=goal_ticks)
 
 
-def tick(
-    task: Task, rng: Rng, before: Episodes, actions: Array
-) -> tuple[Episodes, Array, Bools, Bools, dict[str, Any]]:
+def tick(task: Task, rng: Rng, before: Episodes, actions: Array) -> Outcome:
     """One tick under actions (num, n_driven); episodes that end are not begun anew.
 
     Returns the next episodes; reward, terminated, truncated (num,); and the velocity error [m/s]
@@ -423,19 +395,15 @@ def tick(
     return after, np.where(end, 0.0, earned), end, truncated, info
 
 
-def step(
-    task: Task, rng: Rng, before: Episodes, actions: Array
-) -> tuple[Episodes, Array, Bools, Bools, dict[str, Any]]:
+def step(task: Task, rng: Rng, before: Episodes, actions: Array) -> Outcome:
     """A `tick`, then new episodes where some have ended: same-step resets. Paper: Fig. 4
 
     Their own last observations are in the dictionary as `final_obs`.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> rng, task = np.random.default_rng(0), Task(BROKK_170, PLANT, TaskConfig(), PAPER)
-        >>> _, earned, *_ = step(task, rng, reset(task, rng, 256), np.zeros((256, 4)))
-        >>> earned.shape, bool(earned.max() <= 1)
-        ((256,), True)
+    >>> rng, task = np.random.default_rng(0), Task(BROKK_170, PLANT, TaskConfig(), PAPER)
+    >>> _, earned, *_ = step(task, rng, reset(task, rng, 256), np.zeros((256, 4)))
+    >>> earned.shape, bool(earned.max() <= 1)
+    ((256,), True)
     """
     after, earned, end, truncated, info = tick(task, rng, before, actions)
     if (ended := end | truncated).any():
@@ -460,9 +428,8 @@ def restart(task: Task, rng: Rng, episodes: Episodes, ended: Bools) -> Episodes:
 def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
     """`function` of all arrays in `Episodes`, their `State`, the plant's state, and the memory.
 
-    Example:
-        >>> map_arrays(lambda x: x[0], (np.array([1, 2]), None))
-        (np.int64(1), None)
+    >>> map_arrays(lambda x: x[0], (np.array([1, 2]), None))
+    (np.int64(1), None)
     """
     if first is None:
         return None

@@ -62,11 +62,9 @@ class Log(NamedTuple):
 def machine_log(machine: Machine, recordings: Iterable[tuple[str, Array, Array]]) -> Log:
     """A log from names, commands and encoder angles (T, n) [rad]; velocities are estimated.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> log = machine_log(BROKK_170, [("a", np.zeros((40, 5)), np.zeros((40, 5)))])
-        >>> log.recordings[0].q_dot.shape
-        (40, 5)
+    >>> log = machine_log(BROKK_170, [("a", np.zeros((40, 5)), np.zeros((40, 5)))])
+    >>> log.recordings[0].q_dot.shape
+    (40, 5)
     """
     samples, rate = machine.velocity_samples, machine.rate
     result = [Recording(name, u, q, velocity_of(q, samples, rate)) for name, u, q in recordings]
@@ -76,9 +74,8 @@ def machine_log(machine: Machine, recordings: Iterable[tuple[str, Array, Array]]
 def velocity_of(q: Array, samples: int, rate: float = 20.0) -> Array:
     """`estimate_velocity` [rad/s] of each row of angles [rad] (T, n), at rest before the first.
 
-    Example:
-        >>> velocity_of(np.array([[0.0], [0.1], [0.2]]), 2).ravel().round(6).tolist()
-        [0.0, 2.0, 2.0]
+    >>> velocity_of(np.array([[0.0], [0.1], [0.2]]), 2).ravel().round(6).tolist()
+    [0.0, 2.0, 2.0]
     """
     padded = np.concatenate([np.repeat(q[:1], samples - 1, axis=0), q])
     windows = np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0)
@@ -92,11 +89,9 @@ def sine_command(rng: Rng, machine: Machine, ticks: int) -> Array:
     paper prints no frequencies. These, 0.05 to 5 Hz, are as fast as a policy's commands: on nets
     from slower sines policies learn to shake the valves.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> u = sine_command(np.random.default_rng(0), BROKK_170, 600)
-        >>> u.shape, bool(abs(u).max() <= 80 / 127)
-        ((600,), True)
+    >>> u = sine_command(np.random.default_rng(0), BROKK_170, 600)
+    >>> u.shape, bool(abs(u).max() <= 80 / 127)
+    ((600,), True)
     """
     amplitude = rng.uniform(machine.dead_zones.min(), machine.pwm_limit / PWM_MAX)
     frequency = np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
@@ -108,10 +103,8 @@ def sine_command(rng: Rng, machine: Machine, ticks: int) -> Array:
 def mid_range(rng: Rng, machine: Machine, joint: Rows) -> Array:
     """Angles [rad] (rows, n) at which recordings of these joints begin: amid all ranges.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> mid_range(np.random.default_rng(0), BROKK_170, np.array([3])).round(3).tolist()
-        [[0.0, 0.7, 0.65, 1.75, 1.0]]
+    >>> mid_range(np.random.default_rng(0), BROKK_170, np.array([3])).round(3).tolist()
+    [[0.0, 0.7, 0.65, 1.75, 1.0]]
     """
     low, high = machine.column("q_min"), machine.column("q_max")
     return np.tile((low + high) / 2, (len(joint), 1))
@@ -134,11 +127,9 @@ def collect(
 ) -> Log:
     """Record a plant, one actuator at a time, `hours` for each. Paper: Sec. 3.3 (1 h)
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> log = collect(BROKK_170, 0.001, np.random.default_rng(0))  # 72 samples of each joint
-        >>> sum(len(recording.q) for recording in log.recordings)
-        360
+    >>> log = collect(BROKK_170, 0.001, np.random.default_rng(0))  # 72 samples of each joint
+    >>> sum(len(recording.q) for recording in log.recordings)
+    360
     """
     goal = max(machine.history + 2, round(hours * 3600 * machine.rate))  # samples per joint
     rows = int(np.clip(goal // SEGMENT, 1, 100))  # recordings of a joint, simulated at once
@@ -218,10 +209,9 @@ class Samples(NamedTuple):
 def moving(recording: Recording) -> NDArray[np.bool_]:
     """Which joints have a command or move in a recording (n,); a parked one may creep a little.
 
-    Example:
-        >>> u, q = np.array([[0.0, 0.0], [0.5, 0.0]]), np.zeros((2, 2))
-        >>> moving(Recording("a", u, q, q)).tolist()
-        [True, False]
+    >>> u, q = np.array([[0.0, 0.0], [0.5, 0.0]]), np.zeros((2, 2))
+    >>> moving(Recording("a", u, q, q)).tolist()
+    [True, False]
     """
     commanded = np.ptp(recording.u, axis=0) > COMMANDED
     return np.asarray(commanded | (np.ptp(recording.q, axis=0) > MOVED))
@@ -230,11 +220,10 @@ def moving(recording: Recording) -> NDArray[np.bool_]:
 def join_recordings(log: Log) -> Samples:
     """Join recordings; the target is the velocity of the coming tick, (q(t+dt) - q(t)) / dt.
 
-    Example:
-        >>> q = np.array([[0.0], [0.1], [0.3]])
-        >>> log = Log(("q1",), (Recording("a", 0 * q, q, 0 * q),))
-        >>> join_recordings(log).target[:2].ravel().round(6).tolist()
-        [2.0, 4.0]
+    >>> q = np.array([[0.0], [0.1], [0.3]])
+    >>> log = Log(("q1",), (Recording("a", 0 * q, q, 0 * q),))
+    >>> join_recordings(log).target[:2].ravel().round(6).tolist()
+    [2.0, 4.0]
     """
     lengths = [len(recording.q) for recording in log.recordings]
     moves = np.repeat([moving(recording) for recording in log.recordings], lengths, axis=0)

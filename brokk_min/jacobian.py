@@ -29,10 +29,9 @@ def dls(J: ArrayLike, W: ArrayLike, damping: ArrayLike, as_printed: bool = False
         damping: lambda^2 [m^2], (...); must be positive where J W^-1 J^T is singular.
         as_printed: use the paper's printed form.
 
-    Example:
-        >>> J_inv = dls(np.eye(3), np.ones(3), 1.0)
-        >>> J_inv.diagonal().tolist()  # 1 / (1 + lambda^2)
-        [0.5, 0.5, 0.5]
+    >>> J_inv = dls(np.eye(3), np.ones(3), 1.0)
+    >>> J_inv.diagonal().tolist()  # 1 / (1 + lambda^2)
+    [0.5, 0.5, 0.5]
     """
     J, W = np.asarray(J, float), np.asarray(W, float)
     W_inv = 1 / W[..., None, :]
@@ -47,11 +46,9 @@ def limit_gradient(machine: Machine, q: ArrayLike) -> Array:
 
     h(q) = sum over joints of (q_max - q_min)^2 / (4 (q_max - q) (q - q_min)).
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> middle = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
-        >>> bool(np.allclose(limit_gradient(BROKK_170, middle), 0))
-        True
+    >>> middle = (BROKK_170.column("q_min") + BROKK_170.column("q_max")) / 2
+    >>> bool(np.allclose(limit_gradient(BROKK_170, middle), 0))
+    True
     """
     low, high = machine.column("q_min"), machine.column("q_max")
     margin = 1e-3 * (high - low)  # finite at the limits and beyond
@@ -66,11 +63,9 @@ def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
 
     `q` are angles [rad], `q_dot` velocities whose sign gives the direction. Paper: Sec. 4.2 (W)
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> q = [0.0, 0.7, 1.5, 1.75, 1.0]  # q3 is near its upper limit
-        >>> limit_weights(BROKK_170, q, [0, 0, 1, 0, 0]).round(1)
-        array([ 1. ,  1. , 48.4,  1. ,  1. ])
+    >>> q = [0.0, 0.7, 1.5, 1.75, 1.0]  # q3 is near its upper limit
+    >>> limit_weights(BROKK_170, q, [0, 0, 1, 0, 0]).round(1)
+    array([ 1. ,  1. , 48.4,  1. ,  1. ])
     """
     gradient = limit_gradient(machine, q)
     return np.where(gradient * np.asarray(q_dot) > 0, 1 + np.abs(gradient), 1.0)
@@ -79,9 +74,8 @@ def limit_weights(machine: Machine, q: ArrayLike, q_dot: ArrayLike) -> Array:
 def manipulability(J: ArrayLike) -> Array:
     """w = sqrt(det(J J^T)) [m^3] of Jacobians (..., 3, n), (...); 0: singular. Yoshikawa (1985)
 
-    Example:
-        >>> manipulability(np.diag([1.0, 2.0, 3.0])).round(6).tolist()
-        6.0
+    >>> manipulability(np.diag([1.0, 2.0, 3.0])).round(6).tolist()
+    6.0
     """
     J = np.asarray(J)
     return np.asarray(np.sqrt(np.maximum(np.linalg.det(J @ np.swapaxes(J, -1, -2)), 0.0)))
@@ -90,9 +84,8 @@ def manipulability(J: ArrayLike) -> Array:
 def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
     """lambda^2 = k (1 - w/w0)^2 [m^2] for w < w0, else 0 (Nakamura, 1986). Paper: Sec. 4.2
 
-    Example:
-        >>> nakamura_damping([0.0, 0.5, 1.0, 2.0], 1.0, 0.1)
-        array([0.1  , 0.025, 0.   , 0.   ])
+    >>> nakamura_damping([0.0, 0.5, 1.0, 2.0], 1.0, 0.1)
+    array([0.1  , 0.025, 0.   , 0.   ])
     """
     return k * np.maximum(0.0, 1 - np.asarray(w) / w0) ** 2
 
@@ -101,10 +94,8 @@ def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
 def manipulability_threshold(machine: Machine) -> float:
     """w0: a quarter of the largest manipulability over 2,000 random poses (assumed).
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> round(manipulability_threshold(BROKK_170), 2)  # m^3
-        3.9
+    >>> round(manipulability_threshold(BROKK_170), 2)  # m^3
+    3.9
     """
     low, high = machine.column("q_min"), machine.column("q_max")
     poses = np.random.default_rng(0).uniform(low, high, (2000, machine.n))
@@ -136,11 +127,10 @@ def pid(gains: Gains, error: Array, state: PIDState, dt: float) -> tuple[Array, 
 
     x = kp e + ki integral(e) + kd d, where the derivative is filtered: T d' + d = de/dt.
 
-    Example:
-        >>> one = np.ones(1)
-        >>> state = PIDState(0 * one, one, 0 * one, one)
-        >>> pid(Gains(2 * one, one, 0 * one, one), one, state, 0.05)[0].tolist()
-        [2.0]
+    >>> one = np.ones(1)
+    >>> state = PIDState(0 * one, one, 0 * one, one)
+    >>> pid(Gains(2 * one, one, 0 * one, one), one, state, 0.05)[0].tolist()
+    [2.0]
     """
     T = DERIVATIVE_TIME
     keep, take = T / (T + dt), dt / (T + dt)

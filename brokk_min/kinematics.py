@@ -2,13 +2,6 @@
 
 One forward kinematics gives the frames of a pose; all else is worked out from these frames. The
 base frame has z up; its origin lies on the first axis, for the Brokk at ground level. Paper: Fig. 1
-
-Example:
-    >>> from brokk_min.machine import BROKK_170
-    >>> frames = forward_kinematics(BROKK_170, [1.5, 0.5, 0.58, 1.71, 1.24])
-    >>> x, y, z = tool_position(frames)
-    >>> round(float(np.hypot(x, y)), 2), round(float(z), 2)
-    (3.05, 1.01)
 """
 
 import math
@@ -36,10 +29,8 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
 
     ValueError: `q` has another number of joints.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> forward_kinematics(BROKK_170, np.zeros((256, 5))).p.shape
-        (256, 6, 3)
+    >>> forward_kinematics(BROKK_170, np.zeros((256, 5))).p.shape
+    (256, 6, 3)
     """
     q = 1.0 * np.asarray(q)  # whole numbers become floats
     if q.shape[-1:] != (machine.n,):
@@ -65,9 +56,8 @@ def forward_kinematics(machine: Machine, q: ArrayLike) -> Frames:
 def rotate(a: Array, b: Array, c: Array | float, s: Array | float) -> tuple[Array, Array]:
     """The vectors `a` and `b`, turned in their plane by an angle with cosine `c` and sine `s`.
 
-    Example:
-        >>> rotate(np.array([1, 0]), np.array([0, 1]), 0, 1)  # a quarter turn
-        (array([0, 1]), array([-1,  0]))
+    >>> rotate(np.array([1, 0]), np.array([0, 1]), 0, 1)  # a quarter turn
+    (array([0, 1]), array([-1,  0]))
     """
     return c * a + s * b, c * b - s * a
 
@@ -75,11 +65,9 @@ def rotate(a: Array, b: Array, c: Array | float, s: Array | float) -> tuple[Arra
 def tool_position(frames: Frames) -> Array:
     """Position p_n of the tool tip in the base frame [m], (..., 3).
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> q = [0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4]  # the arm straight and level
-        >>> tool_position(forward_kinematics(BROKK_170, q)).round(2) + 0.0
-        array([5.  , 0.  , 0.95])
+    >>> q = [0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4]  # the arm straight and level
+    >>> tool_position(forward_kinematics(BROKK_170, q)).round(2) + 0.0
+    array([5.  , 0.  , 0.95])
     """
     return frames.p[..., -1, :]
 
@@ -89,11 +77,9 @@ def jacobian(frames: Frames) -> Array:
 
     J_i = z_{i-1} x (p_n - p_{i-1}), i = 1 .. n; J_i = z_{i-1} of a prismatic joint.
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> J = jacobian(forward_kinematics(BROKK_170, np.zeros((256, 5))))
-        >>> J.shape, J[0, 1, 0].round(2).tolist()  # the slew moves the tool along y
-        ((256, 3, 5), 2.35)
+    >>> J = jacobian(forward_kinematics(BROKK_170, np.zeros((256, 5))))
+    >>> J.shape, J[0, 1, 0].round(2).tolist()  # the slew moves the tool along y
+    ((256, 3, 5), 2.35)
     """
     J = np.cross(frames.z[..., :-1, :], frames.p[..., -1:, :] - frames.p[..., :-1, :])
     for i in frames.prismatic:
@@ -106,11 +92,9 @@ def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
 
     `q_dot` [rad/s or m/s] (..., n) is of all joints, locked ones included. Paper: Sec. 3.4
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> frames = forward_kinematics(BROKK_170, np.zeros(5))
-        >>> tool_velocity(frames, [1.0, 0.0, 0.0, 0.0, 0.0]).round(2) + 0.0
-        array([0.  , 2.35, 0.  ])
+    >>> frames = forward_kinematics(BROKK_170, np.zeros(5))
+    >>> tool_velocity(frames, [1.0, 0.0, 0.0, 0.0, 0.0]).round(2) + 0.0
+    array([0.  , 2.35, 0.  ])
     """
     return np.asarray((jacobian(frames) @ np.asarray(q_dot)[..., None])[..., 0])  # v = J q_dot
 
@@ -118,10 +102,8 @@ def tool_velocity(frames: Frames, q_dot: ArrayLike) -> Array:
 def lowest_point(frames: Frames) -> Array:
     """Height of the lowest of the origins p_1 .. p_n, the ends of the links [m], (...).
 
-    Example:
-        >>> from brokk_min.machine import BROKK_170
-        >>> frames = forward_kinematics(BROKK_170, [0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])
-        >>> round(float(lowest_point(frames)), 2)
-        0.95
+    >>> frames = forward_kinematics(BROKK_170, [0.0, 0.0, 0.0, np.pi, 3 * np.pi / 4])
+    >>> round(float(lowest_point(frames)), 2)
+    0.95
     """
     return np.asarray(frames.p[..., 1:, 2].min(axis=-1))

@@ -19,10 +19,9 @@ PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] n
 def require(fact: bool, field: str, wanted: str, got: Any) -> None:
     """ValueError "field: expected wanted, got got" unless `fact` holds.
 
-    Example:
-        >>> require(False, "--seeds", "1 or more", 0)
-        Traceback (most recent call last):
-        ValueError: --seeds: expected 1 or more, got 0
+    >>> require(False, "--seeds", "1 or more", 0)
+    Traceback (most recent call last):
+    ValueError: --seeds: expected 1 or more, got 0
     """
     if not fact:
         raise ValueError(f"{field}: expected {wanted}, got {got}")
@@ -35,15 +34,13 @@ def python_numbers(value: Any, place: str = "") -> None:
     """
     for field in fields(value):
         found = getattr(value, field.name)
-        plain = found.tolist() if isinstance(found, np.generic | np.ndarray) else found
-        if isinstance(plain, list | tuple):
-            plain = tuple(x.item() if isinstance(x, np.generic) else x for x in plain)
-        if field.type in (int, float):
-            kinds = int if field.type is int else int | float
-            wanted = "a whole number" if field.type is int else "a finite number"
-            fits = isinstance(plain, kinds) and bool(np.isfinite(plain))
-            require(fits, place + field.name, wanted, found)
-        object.__setattr__(value, field.name, plain)
+        plain = np.asarray(found).tolist()
+        if field.type is int:
+            require(isinstance(plain, int), place + field.name, "a whole number", found)
+        if field.type is float:
+            finite = isinstance(plain, int | float) and bool(np.isfinite(plain))
+            require(finite, place + field.name, "a finite number", found)
+        object.__setattr__(value, field.name, tuple(plain) if isinstance(plain, list) else plain)
 
 
 @dataclass(frozen=True)
@@ -152,9 +149,8 @@ class Machine:
         for j in self.joints:
             pair = np.shape(j.dead_zone) == (2,)
             require(pair, f"{j.name}.dead_zone", "a pair, up and down", j.dead_zone)
-            for name in ("q_dot_up", "q_dot_down"):
-                speed = getattr(j, name)
-                require(speed > 0, f"{j.name}.{name}", "a positive number", speed)
+            slower = min(j.q_dot_up, j.q_dot_down)
+            require(slower > 0, f"{j.name}.q_dot_up, q_dot_down", "positive numbers", slower)
             known = j.kind in ("revolute", "prismatic")
             require(known, f"{j.name}.kind", "revolute or prismatic", j.kind)
             require(j.q_min < j.q_max, f"{j.name}.q_max", f"above {j.q_min}", j.q_max)
@@ -222,9 +218,8 @@ class Controller(Protocol):
 def by_direction(u: Array, pairs: ArrayLike) -> Array:
     """`pairs[..., 0]`, up, where u (...) > 0, else `pairs[..., 1]`, down.
 
-    Example:
-        >>> by_direction(np.array([0.5, -0.5]), [0.1, 0.2]).tolist()
-        [0.1, 0.2]
+    >>> by_direction(np.array([0.5, -0.5]), [0.1, 0.2]).tolist()
+    [0.1, 0.2]
     """
     pairs = np.asarray(pairs, u.dtype)
     return np.where(u > 0, pairs[..., 0], pairs[..., 1])
@@ -235,9 +230,8 @@ def valve_opening(u: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.floating]:
 
     `dead_zones` (..., 2) are up and down of each command. Paper: Sec. 3.3 (7 %)
 
-    Example:
-        >>> valve_opening([0.535, 0.07, -1.0], (0.07, 0.07)).round(3) + 0.0
-        array([ 0.5,  0. , -1. ])
+    >>> valve_opening([0.535, 0.07, -1.0], (0.07, 0.07)).round(3) + 0.0
+    array([ 0.5,  0. , -1. ])
     """
     u = 1.0 * np.asarray(u)  # whole numbers become floats
     zone = by_direction(u, dead_zones)
@@ -247,9 +241,8 @@ def valve_opening(u: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.floating]:
 def valve_command(opening: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.floating]:
     """The command that opens a valve so far: the inverse of `valve_opening`, 0 for 0.
 
-    Example:
-        >>> valve_command([0.5, 0.0, -1.0], (0.07, 0.07)).round(3)
-        array([ 0.535,  0.   , -1.   ])
+    >>> valve_command([0.5, 0.0, -1.0], (0.07, 0.07)).round(3)
+    array([ 0.535,  0.   , -1.   ])
     """
     x = 1.0 * np.asarray(opening)
     zone = by_direction(x, dead_zones)
@@ -259,9 +252,8 @@ def valve_command(opening: ArrayLike, dead_zones: ArrayLike) -> NDArray[np.float
 def limit_command(machine: Machine, u: ArrayLike) -> NDArray[np.floating]:
     """The command that reaches the valve: whole counts, clipped to the limit. Paper: Sec. 3.2
 
-    Example:
-        >>> limit_command(BROKK_170, [1.0, 0.5, -1.0]) * 127
-        array([ 80.,  64., -80.])
+    >>> limit_command(BROKK_170, [1.0, 0.5, -1.0]) * 127
+    array([ 80.,  64., -80.])
     """
     u = 1.0 * np.asarray(u)  # whole numbers become floats
     counts = np.clip(np.rint(u * PWM_MAX), -machine.pwm_limit, machine.pwm_limit)
@@ -275,9 +267,8 @@ def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
 
     Paper: Sec. 3.2 (the pairs 80/175 and 50/205 sum to 255). ValueError: `u` outside [-1, 1].
 
-    Example:
-        >>> encode_pwm(np.array([80, -80, 50, -50, 0]) / 127).tolist()
-        [80, 175, 50, 205, 0]
+    >>> encode_pwm(np.array([80, -80, 50, -50, 0]) / 127).tolist()
+    [80, 175, 50, 205, 0]
     """
     u = np.asarray(u, float)
     require(bool((np.abs(u) <= 1).all()), "u", "within [-1, 1]", u.tolist())
@@ -288,9 +279,8 @@ def encode_pwm(u: ArrayLike) -> NDArray[np.uint8]:
 def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
     """Command in [-1, 1] for a byte (...); 0 and 255: idle. Paper: Sec. 3.2
 
-    Example:
-        >>> decode_pwm([80, 175, 0, 255]) * 127
-        array([ 80., -80.,   0.,   0.])
+    >>> decode_pwm([80, 175, 0, 255]) * 127
+    array([ 80., -80.,   0.,   0.])
     """
     u_byte = np.asarray(u_byte).astype(int)
     return np.asarray(np.where(u_byte > PWM_MAX, u_byte - 255, u_byte) / PWM_MAX)
@@ -299,9 +289,8 @@ def decode_pwm(u_byte: ArrayLike) -> NDArray[np.float64]:
 def read_encoder(machine: Machine, q: ArrayLike) -> NDArray[np.floating]:
     """What encoders report for true angles `q` (..., n): whole counts, of the same float type.
 
-    Example:
-        >>> read_encoder(BROKK_170, [0.0, 0.001, 0.002, 1.0, 0.0]).round(4)
-        array([0.    , 0.0015, 0.0015, 1.0002, 0.    ])
+    >>> read_encoder(BROKK_170, [0.0, 0.001, 0.002, 1.0, 0.0]).round(4)
+    array([0.    , 0.0015, 0.0015, 1.0002, 0.    ])
     """
     q = 1.0 * np.asarray(q)
     return np.asarray(np.rint(q / machine.encoder_step) * machine.encoder_step, q.dtype)

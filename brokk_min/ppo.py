@@ -35,9 +35,8 @@ def layer_init(layer: nn.Linear, std: float) -> nn.Linear:
 def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
     """256-128-64 with ELU and a linear output. Paper: Sec. 3.4
 
-    Example:
-        >>> mlp(163, 4, 0.01)(torch.zeros(256, 163)).shape
-        torch.Size([256, 4])
+    >>> mlp(163, 4, 0.01)(torch.zeros(256, 163)).shape
+    torch.Size([256, 4])
     """
     layers: list[nn.Module] = []
     for size_in, size_out in ((inputs, 256), (256, 128), (128, 64)):
@@ -100,10 +99,9 @@ Advantages = Callable[[Agent, Rollout, PPOConfig], tuple[Tensor, Tensor | None]]
 def log_probability(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Log-density (...) of actions (..., a) under independent normal distributions.
 
-    Example:
-        >>> zero = torch.zeros(1)
-        >>> round(log_probability(zero, zero, zero).item(), 4)  # -log(2 pi) / 2
-        -0.9189
+    >>> zero = torch.zeros(1)
+    >>> round(log_probability(zero, zero, zero).item(), 4)  # -log(2 pi) / 2
+    -0.9189
     """
     z = (actions - mean) * torch.exp(-log_std)
     return -0.5 * (z * z).sum(-1) - log_std.sum() - 0.5 * actions.shape[-1] * math.log(2 * math.pi)
@@ -143,10 +141,9 @@ def gae(
     `values` are V(s_t), `next_values` V(s_{t+1}): 0 where the episode terminated, that of its own
     last observation where it was truncated. `dones` is 1 where it terminated or was truncated.
 
-    Example:
-        >>> one = torch.ones(2, 1)
-        >>> gae(one, 0 * one, 0 * one, 0 * one, 0.5, 1.0).ravel().tolist()
-        [1.5, 1.0]
+    >>> one = torch.ones(2, 1)
+    >>> gae(one, 0 * one, 0 * one, 0 * one, 0.5, 1.0).ravel().tolist()
+    [1.5, 1.0]
     """
     delta = rewards + gamma * next_values - values  # r_t + gamma V(s_{t+1}) - V(s_t)
     advantages = torch.empty_like(delta)
@@ -172,9 +169,8 @@ def critic_advantages(agent: Agent, rollout: Rollout, config: PPOConfig) -> tupl
 def policy_loss(ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
     """-E[min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)] of ratios and advantages (B,).
 
-    Example:
-        >>> policy_loss(torch.tensor([1.5]), torch.ones(1), 0.2).item()  # no more than 1.2
-        -1.2000000476837158
+    >>> policy_loss(torch.tensor([1.5]), torch.ones(1), 0.2).item()  # no more than 1.2
+    -1.2000000476837158
     """
     clipped = torch.clamp(ratio, 1 - clip, 1 + clip)
     return -torch.min(ratio * advantages, clipped * advantages).mean()
@@ -243,10 +239,9 @@ def improve(
 def steered(learning_rate: float, approx_kl: float, config: PPOConfig) -> float:
     """Lower after a large change of the policy, higher after a small one, much as in rl_games.
 
-    Example:
-        >>> config = PPOConfig(learning_rate=0.012, target_kl=0.03)
-        >>> round(steered(0.006, 0.1, config), 6), round(steered(0.006, 0.01, config), 6)
-        (0.005, 0.0072)
+    >>> config = PPOConfig(learning_rate=0.012, target_kl=0.03)
+    >>> round(steered(0.006, 0.1, config), 6), round(steered(0.006, 0.01, config), 6)
+    (0.005, 0.0072)
     """
     if approx_kl > 1.5 * config.target_kl:
         return learning_rate / 1.2

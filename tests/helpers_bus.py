@@ -94,7 +94,7 @@ class World:
     def __init__(self, controller, operator, log=None, machine=BROKK_170):
         self.time = 0.0  # s
         self.recorder = Recorder()
-        self.simulated = FaultyMachine(machine, start_pose(machine), 0.0, self.recorder)
+        self.simulated = FaultyMachine(machine, start_pose(machine), 0.0, self.recorder, [])
         self.answers = deque()
         self.upward = self.downward = unchanged
         self.noise = list  # foreign frames of the next millisecond

@@ -92,10 +92,8 @@ def learn(
     machine: Machine, net: ActuatorNet, known: Known, runs: Array, history: Array
 ) -> tuple[Known, Array]:
     """What is known, and the runs, after a tick that ends `history` (..., n_driven, 3, H)."""
-    (q_now, v, sent), zones = (
-        np.moveaxis(history[..., -1], -1, 0),
-        machine.dead_zones[machine.driven],
-    )
+    q_now, v, sent = np.moveaxis(history[..., -1], -1, 0)
+    zones = machine.dead_zones[machine.driven]
     opening = valve_opening(sent, zones)
     u = np.stack([sent, valve_command(opening + WIDER * np.sign(opening), zones)])
     q = runs[..., 0, -1] + machine.dt * net.predict(append_command(runs, u))

@@ -170,15 +170,10 @@ class FaultyMachine(SimulatedMachine):
     """
 
     def __init__(
-        self,
-        machine: Machine,
-        q: ArrayLike,
-        now: float,
-        plant: Plant = PLANT,
-        faults: Sequence[Fault] = (),
+        self, machine: Machine, q: ArrayLike, now: float, plant: Plant, faults: list[Fault]
     ) -> None:
         super().__init__(machine, q, now, plant)
-        self.faults = [*faults]
+        self.faults = faults
         self.last: dict[int, bytes] = {}  # sound data of each node
         self.frames = dict.fromkeys(self.nmt, 0)  # of each node, so far
         self.late: list[tuple[float, int, bytes]] = []  # time to come, node, data
@@ -214,33 +209,29 @@ class FaultyMachine(SimulatedMachine):
 
     def _fault(self, node: int, now: float) -> tuple[str, float]:
         """Kind of the newest fault of a node that has begun, and the time since then [s]."""
-        begun = [fault for fault in self.faults if fault.node == node]
-        begun = [fault for fault in begun if self.start + fault.time <= now]
+        since = now - self.start
+        begun = [fault for fault in self.faults if fault.node == node and fault.time <= since]
         newest = max(begun, key=lambda fault: fault.time, default=Fault(node, "ok", 0.0))
-        return newest.kind, now - self.start - newest.time
+        return newest.kind, since - newest.time
 
     def _through(self, node: int, data: bytes, now: float) -> list[bytes]:
         """What comes of a frame of a node: nothing, or its data, perhaps changed."""
         kind, seconds = self._fault(node, now)
         self.frames[node] += 1
-        match kind:
-            case "off":
-                return []
-            case "stuck":
-                return [self.last.get(node, data)]
-            case "garbage":
-                return [self.rng.bytes(len(data))]
-            case "wrong":
-                return [bytes([data[0] ^ 0x40, *data[1:]])]
-            case "slow":
-                return [data] * (self.frames[node] % 2)
-            case "delayed":
-                self.late.append((now + DELAY, node, data))
-                return []
-            case "intermittent":
-                return [data] * int(seconds // PAUSE % 2)
-        self.last[node] = data
-        return [data]
+        if kind == "ok":
+            self.last[node] = data
+        if kind == "delayed":
+            self.late.append((now + DELAY, node, data))
+        return {
+            "ok": [data],
+            "off": [],
+            "delayed": [],
+            "stuck": [self.last.get(node, data)],
+            "garbage": [self.rng.bytes(len(data))],
+            "wrong": [bytes([data[0] ^ 0x40, *data[1:]])],
+            "slow": [data] * (self.frames[node] % 2),
+            "intermittent": [data] * int(seconds // PAUSE % 2),
+        }[kind]
 
 
 def start_pose(machine: Machine) -> Array:
@@ -251,11 +242,7 @@ def start_pose(machine: Machine) -> Array:
 
 
 def run_machine(
-    machine: Machine,
-    interface: str,
-    channel: str,
-    plant: Plant = PLANT,
-    faults: Sequence[Fault] = (),
+    machine: Machine, interface: str, channel: str, plant: Plant, faults: list[Fault]
 ) -> None:
     """Run a simulated machine on a bus until a signal; it prints why its valve controller stops."""
     gc.freeze()  # no long garbage collection while the encoders should answer

@@ -31,8 +31,6 @@ class Evaluate(Command):
     seed: int = 0  # Of the noise, and of what is drawn and tuned.
 
     def __call__(self, machine: Machine) -> None:
-        check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
-        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         path, gains = default_policy(machine, self.policy)
         elsewhere = gains and gains.parent != path.parent and self.plant != "analytic"
         gains = None if self.save_gains or elsewhere else gains
@@ -109,7 +107,6 @@ class Reproduce(Command):
         require_package("torch", "train")
         from brokk_min.evaluation.reproduce import QUICK, Budget, reproduce  # loads torch
 
-        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         budget = QUICK if self.quick else Budget()
         file = self.out / "results.json"
         check(self.force or not file.exists(), str(file), "no file (or --force)", "one")

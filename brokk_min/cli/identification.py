@@ -18,7 +18,7 @@ from brokk_min.can.drive_log import log_for_fit, read_frames, timing
 from brokk_min.cli.options import Command, check, check_settings, find_plant
 from brokk_min.fit import SINE, Log, collect
 from brokk_min.identification import columns, logs
-from brokk_min.identification.fit_config import PAPER_RECIPE, OurFitConfig
+from brokk_min.identification.fitting import PAPER_RECIPE, OurFitConfig
 from brokk_min.identification.net_file import load_net, save_net, select_nets
 from brokk_min.machine import BROKK_170, Machine, require
 
@@ -35,7 +35,6 @@ class Collect(Command):
 
     def __call__(self, machine: Machine) -> None:
         check(self.out.suffix in (".csv", ".npz"), "--out", "a name in .csv or .npz", self.out)
-        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         check(0 < self.hours <= 100, "--hours", "above 0, to 100", self.hours)
         self.writes(self.out)
         rng, plant = np.random.default_rng(self.seed), find_plant(self.plant, machine)
@@ -128,7 +127,6 @@ class Fit(ReadsLogs):
         check_settings(settings)
         fits = settings.valve or settings.members == 1
         check(fits, "--members", "1 of nets that read the commands", settings.members)
-        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs, machine)

@@ -102,8 +102,7 @@ class DriveMachine(Command):
     def keep_valves(self, machine: Machine, controller: Controller) -> None:
         """Print what is known of the valves, and write it to `valves`."""
         if isinstance(controller, Adaptive) and controller.known:
-            for line in describe(machine, controller.known):
-                print(line)
+            print(*describe(machine, controller.known), sep="\n")
             if self.valves:
                 save_known(self.valves, machine, controller.net, controller.known)
 
@@ -218,6 +217,4 @@ class Export(Command):
         export_onnx(self.out, policy)
         print(f"{self.out}: observation (batch, obs) in, action (batch, driven joints) out")
         if policy.interface != "paper":
-            print(
-                "examples/run_onnx.py has the observation of train --paper, not that of this policy"
-            )
+            print("examples/run_onnx.py has the observation of train --paper, not this policy's")

@@ -48,6 +48,12 @@ class Command:
     machine: str = BROKK_170.name  # Which machine; FILE.py:NAME runs a file that you trust.
     force: bool = False  # Write over files that exist.
 
+    def check_numbers(self) -> None:
+        """WrongUse: a seed or a number of starts that is none."""
+        seed, num_starts = getattr(self, "seed", 0), getattr(self, "num_starts", 1)
+        check(seed >= 0, "--seed", "0 or more", seed)
+        check(num_starts > 0, "--num-starts", "1 or more", num_starts)
+
     @classmethod
     def defaults(cls, options: list[str]) -> Any:
         """The defaults, if some options change them."""

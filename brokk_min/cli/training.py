@@ -10,7 +10,7 @@ from brokk_min._files import SHIPPED, require_package
 from brokk_min.actuator import ActuatorNet
 from brokk_min.cli.evaluation import table
 from brokk_min.cli.options import Command, check, check_settings, load_pids
-from brokk_min.evaluation import metrics, progress, sequences
+from brokk_min.evaluation import baselines, metrics, sequences
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import load_policy
 from brokk_min.learning.recipes import Recipe, find_recipe
@@ -49,7 +49,6 @@ class Training(Command):
     def recipe(self) -> Recipe:
         """The agent, its learner and its task."""
         require_package("torch", "train")
-        check(self.seed >= 0, "--seed", "0 or more", self.seed)
         learner, task = self.learner, self.task
         check_settings(learner)
         check_settings(task)
@@ -88,7 +87,7 @@ class Train(Training):
             net, look = self.find_net(machine), None
             if machine == BROKK_170:  # the package has PIDs of it
                 pids = load_pids(machine, SHIPPED / machine.name / "gains.json", net)
-                look = progress.beside_pids(machine, pids)
+                look = baselines.beside_pids(machine, pids)
             policy = train_policy(machine, net, recipe, self.seed, self.out, look)
         finally:
             if checkpoint.exists() and not checkpoint.stat().st_size:  # nothing is learned yet
@@ -118,7 +117,6 @@ class Sweep(Training):
         from brokk_min.evaluation.sweep import sweep
 
         check(self.seeds > 0, "--seeds", "1 or more", self.seeds)
-        check(self.num_starts > 0, "--num-starts", "1 or more", self.num_starts)
         seeds = range(self.seed, self.seed + self.seeds)
         task = machine, self.find_net(machine), recipe, seeds, self.out, self.num_starts
         table = sweep(*task, self.scheduler, self.robustness)

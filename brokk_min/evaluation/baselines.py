@@ -19,7 +19,7 @@ from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.identification.net_file import fingerprint, select_nets
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
-from brokk_min.machine import Array, Machine, require
+from brokk_min.machine import Array, Controller, Machine, require
 from brokk_min.settings import TaskConfig
 
 BY_HAND, RAW = "pid_by_hand", "pid_by_hand_raw"
@@ -32,6 +32,8 @@ EFFORT: Effort = (40, 30, 20.0)  # assumed
 CANDIDATES = 24  # of each generation
 SPREAD = 0.12  # of the first candidates, as a fraction of the roots of the ranges, assumed
 OVERSHOOT = 0.2  # of a step of velocity, that tuning by hand allows
+LOOK_RUNS, LOOK_SECONDS = 16, 10.0  # motions that a training looks at, and how long each is [s]
+LOOK_SEED = 1  # of these motions; the PIDs are tuned on those of seed 0, and scored ones are others
 RANGES = {  # that `tune` searches (assumed); each driven joint has its own kp, ki and kd
     "kp": (0.0, 4.0),  # valve opening per rad/s
     "ki": (0.0, 30.0),  # valve opening per rad
@@ -195,6 +197,23 @@ def tuned_baselines(
         cost = partial(tuning_cost, first[name], runs, seed, plant)
         gains[name] = tune(gains[name], cost, seed, factor * generations)
     return baselines(machine, net, gains)
+
+
+def beside_pids(machine: Machine, pids: Baselines) -> Callable[[Controller], str]:
+    """A function that says a policy's mean |v_goal - v_tool| [m/s] beside those of two PIDs.
+
+    All drive the analytic plant along the same motions, which are neither tuned on nor scored.
+    """
+    start, goals = tuning_set(machine, LOOK_RUNS, LOOK_SEED, LOOK_SECONDS)
+
+    def error(controller: Controller) -> str:
+        rng = np.random.default_rng(LOOK_SEED)
+        trace = rollout(machine, controller, start, goals, TaskConfig.noise, rng)
+        return f"{np.linalg.norm(goals - trace.v_tool, axis=-1).mean():.4f}"
+
+    pid = f"the PID tuned by hand has {error(pids[BY_HAND])}, the optimised one"
+    pid = f"{pid} {error(pids[OPTIMISED])}"
+    return lambda policy: f"{error(policy)} m/s; {pid}"
 
 
 def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, Any]:

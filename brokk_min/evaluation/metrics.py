@@ -152,12 +152,7 @@ def by_start(runs: Sequence[Run], controller: str, sequence: str, key: str) -> A
 
 
 def mean_interval(values: Array) -> Mean:
-    """Mean, and its 95 % confidence interval by Student's t; None for what too few values have.
-
-    Example:
-        >>> {key: round(x, 3) for key, x in mean_interval(np.array([1.0, 2.0, 3.0])).items()}
-        {'mean': 2.0, 'low': -0.484, 'high': 4.484}
-    """
+    """Mean, and its 95 % confidence interval by Student's t; None for what too few values have."""
     from scipy.special import stdtrit  # Student's t quantile; slow to import
 
     mean = float(values.mean()) if len(values) else None
@@ -170,9 +165,8 @@ def mean_interval(values: Array) -> Mean:
 def interval_text(number: Mean) -> str:
     """A mean with its interval, if it was measured and has one.
 
-    Example:
-        >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
-        '0.0123 (-0.5000 to 41.27)'
+    >>> interval_text({"mean": 0.01234, "low": -0.5, "high": 41.267})
+    '0.0123 (-0.5000 to 41.27)'
     """
     texts = [f"{x:.4f}" if abs(x) < 1 else f"{x:.4g}" for x in number.values() if x is not None]
     texts = texts or ["not measured"]
@@ -207,8 +201,6 @@ def compare(runs: Sequence[Run], one: str, other: str, key: str) -> dict[str, di
         row: dict[str, Any] = dict(mean_interval(100 * (mine - its) / whole))
         parts = [sequence] if sequence != "all" else column(runs, "sequence")
         won = [by_start(runs, one, of, key) < by_start(runs, other, of, key) for of in parts]
-        result[sequence] = row | {
-            "won": sum(of.sum().item() for of in won),
-            "runs": sum(map(len, won)),
-        }
+        row |= {"won": sum(of.sum().item() for of in won), "runs": sum(map(len, won))}
+        result[sequence] = row
     return result

@@ -26,9 +26,8 @@ TITLES = {  # of controllers in tables, figures and windows, by their names in f
 def title(name: str) -> str:
     """How tables name a controller; "+cold" and "+warm" are of `evaluation.adaptive`."""
     plain, _, start = name.partition("+")
-    return (
-        TITLES.get(plain, plain) + {"": "", "cold": ", adaptive", "warm": ", adaptive, warm"}[start]
-    )
+    learns = {"": "", "cold": ", adaptive", "warm": ", adaptive, warm"}
+    return TITLES.get(plain, plain) + learns[start]
 
 
 def valves_at_rest(name: str) -> str:

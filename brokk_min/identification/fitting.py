@@ -1,22 +1,40 @@
-"""Our fit: that of the paper, with what `beyond` adds and the settings ask for."""
+"""Our fit: that of the paper, with what `beyond` adds and the settings ask for.
 
-from dataclasses import replace
+Only what fits imports torch, because the help of the command reads the settings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from brokk_min import fit as paper
 from brokk_min.actuator import ActuatorNet
-from brokk_min.beyond import free_runs
 from brokk_min.beyond.net_ensemble import NetEnsemble
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
-from brokk_min.fit import Log, TrainingSet
-from brokk_min.identification.fit_config import PAPER_RECIPE, OurFitConfig
+from brokk_min.fit import FitConfig, Log, TrainingSet
 from brokk_min.machine import Array, Machine
 
-__all__ = ["PAPER_RECIPE", "OurFitConfig", "fit_nets"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True)
+class OurFitConfig(FitConfig):
+    """How the nets are fitted: the settings of `fit`, and those of `beyond`."""
+
+    weight_decay: float = 0.0  # 0.3 for logs of a few minutes
+    rollout: int = 8  # ticks of the errors in the last third of the steps (paper: 1)
+    valve: bool = True  # --no-valve: nets read commands as they are, not what these open (paper)
+    members: int = 5  # such nets a joint, 1 of others; their mean counts (beyond.net_ensemble)
+    newest_only: bool = False  # do they read commands and the newest angle and velocity alone?
+
+
+# Sec. 3.3: errors of one step, commands as they are
+PAPER_RECIPE: dict[str, Any] = {"rollout": 1, "valve": False, "members": 1}
 
 
 class ValveTrainingSet(TrainingSet):
@@ -32,6 +50,8 @@ class ValveTrainingSet(TrainingSet):
 
     def inputs(self, history: Tensor) -> Tensor:
         """`valve_inputs`, (..., n, 4 H) of histories (..., n, 3, H)."""
+        import torch
+
         inputs: Tensor = valve_inputs(history, torch.from_numpy(self.zones), torch)
         return inputs
 
@@ -47,6 +67,8 @@ def fit_nets(
         config = replace(config, valve=False, members=1)
     fit_weights = paper.fit_weights
     if config.rollout > 1 or config.weight_decay or config.newest_only:
+        from brokk_min.beyond import free_runs
+
         ours = (config.rollout, config.weight_decay, config.newest_only)
         fit_weights = partial(free_runs.fit_weights, ours=ours)
     index = [machine.names.index(joint) for joint in log.joints] if config.valve else []

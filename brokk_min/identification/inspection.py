@@ -10,7 +10,7 @@ recorded range do not count, because a joint that is pushed against its stop sta
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
+from itertools import compress, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,20 +51,23 @@ FASTER, SLOWER = 1.2, 0.4  # of the machine's fastest motion, which are in the l
 AT_LIMIT = 0.95  # of the command limit: such commands should give the fastest motion
 
 
+Pair = tuple[float, float]  # up and down, or low and high
+
+
 class JointReport(NamedTuple):
     """One joint of a log; pairs are up and down."""
 
     minutes: float  # in recordings in which it has commands
     low: float  # rad, smallest angle
     high: float  # rad
-    fastest: tuple[float, float]  # rad/s, of the velocities in the log
-    largest: tuple[float, float]  # commands, of full command
+    fastest: Pair  # rad/s, of the velocities in the log
+    largest: Pair  # commands, of full command
     sign: int  # of the velocity under a positive command; 0: not clear
     explained: float  # part of the velocities' power that the model explains
     coarse: float  # the same of means over half a second, in which noise and steps do not count
     delay: float  # s
     tau: float  # s
-    dead_zone: tuple[float, float]  # of full command
+    dead_zone: Pair  # of full command
     step: float  # rad, by which its angle usually changes in a tick, if it does
     by_zones: float  # part that it explains with the machine's dead zones; 1 if these are unknown
     still: list[str]  # recordings in which commands do not move it; all else is without them
@@ -87,9 +90,7 @@ def inspect(log: Log, machine: Machine | None = None) -> dict[str, JointReport]:
     return reports
 
 
-def inspect_joint(
-    log: Log, recordings: list[Recording], j: int, zones: tuple[float, float] | None
-) -> JointReport:
+def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | None) -> JointReport:
     """The report of joint `j`, by recordings in which it has commands or moves.
 
     `zones` are the dead zones of the machine. What the joint follows is not looked at.
@@ -98,16 +99,15 @@ def inspect_joint(
     u, q = (np.concatenate([x[:, j] for x in of]) for of in list(zip(*recordings))[1:3])
     span = (q.min(), q.max())
     each = [motion_of([one], j, rate, span) for one in recordings]
-    rows = [*range(len(recordings))]
-    sound = [i for i in rows if np.ptp(recordings[i].q[:, j]) > MOVED] or rows
+    still = np.array([np.ptp(one.q[:, j]) <= MOVED for one in recordings])
     for _ in range(4):  # again without those in which it stands still, until they are found
-        motion = motion_of([recordings[i] for i in sound], j, rate, span)
+        before = still
+        kept = [*compress(recordings, ~still | still.all())]
+        motion = motion_of(kept, j, rate, span)
         model = fit_model(motion)
-        moves = [i for i in rows if not stands_still(each[i], model, motion)]
-        if moves in ([], sound):
+        still = np.array([stands_still(one, model, motion) for one in each])
+        if still.all() or (still == before).all():
             break
-        sound = moves
-    kept = [recordings[i] for i in sound]
     q_dot = np.concatenate([one.q_dot[:, j] for one in kept])
     steps = np.abs(np.diff(q))
     by = {
@@ -118,6 +118,7 @@ def inspect_joint(
     other = max(by, key=lambda name: by[name], default="")
     driven = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
     held = means(motion, motion.u, 1.0)
+    coarse = (means(motion, x, COARSE) for x in (motion.velocity, expected_velocity(motion, model)))
     return JointReport(
         minutes=driven / rate / 60,
         low=span[0],
@@ -126,14 +127,14 @@ def inspect_joint(
         largest=(held.max(), -held.min()),
         sign=sign(np.concatenate([one.u[:, j] for one in kept]), q_dot, rate),
         explained=model.explained,
-        coarse=coarsely_explained(motion, model),
+        coarse=explained_part(*coarse),
         delay=model.lag[0] / rate,
         tau=model.lag[1],
         dead_zone=(model.zones[0], model.zones[1]),
         step=float(np.median(steps[steps > 0])) if steps.any() else 0.0,
         by_zones=best_lag(motion, np.array(zones)).explained if zones else 1.0,
-        still=[recordings[i].name for i in rows if i not in moves],
-        opposite=[recordings[i].name for i in rows if contradicts(each[i], model)],
+        still=[one.name for one in compress(recordings, still)],
+        opposite=[a.name for a, b in zip(recordings, each) if contradicts(b, model)],
         follows={},
         other=other if by.get(other, 0) > LEAST_EXPLAINED else "",
         rest=rest_of(motion_of(list(log.recordings), j, rate, span)),
@@ -175,18 +176,13 @@ class Motion(NamedTuple):
 
 
 def motion_of(
-    recordings: list[Recording],
-    j: int,
-    rate: float,
-    span: tuple[float, float],
-    commands: int | None = None,
+    recordings: list[Recording], j: int, rate: float, span: Pair, commands: int | None = None
 ) -> Motion:
     """Joint `j` of recordings that begin at rest, in its range `span` [rad].
 
     Its commands may be those of another joint.
     """
-    rest = (0, round(PAUSE * rate))
-    of = j if commands is None else commands
+    rest, of = (0, round(PAUSE * rate)), j if commands is None else commands
     u = np.concatenate([np.pad(one.u[:, of], rest) for one in recordings])
     q = np.concatenate([np.pad(one.q[:, j], rest, "edge") for one in recordings])
     counts = np.concatenate([np.pad(np.ones(len(one.u), bool), rest) for one in recordings])
@@ -224,13 +220,17 @@ def best_lag(motion: Motion, zones: Array) -> Model:
 
 
 def with_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> Model:
-    """The model with the best gains; without motion it explains nothing."""
+    """The model with the best gains."""
     x = responses(motion, lag, zones)[:, motion.counts]
     velocity = motion.velocity[motion.counts]
     gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
-    error, power = velocity - gains @ x, float(velocity @ velocity)
-    explained = 1 - float(error @ error) / power if power else 0.0
-    return Model(explained, lag, zones, gains)
+    return Model(explained_part(velocity, gains @ x), lag, zones, gains)
+
+
+def explained_part(velocity: Array, expected: Array) -> float:
+    """Part of the power of velocities (T,) that is as expected; without motion nothing is."""
+    error, power = velocity - expected, float(velocity @ velocity)
+    return 1 - float(error @ error) / power if power else 0.0
 
 
 def responses(motion: Motion, lag: tuple[int, float], zones: Array) -> Array:
@@ -251,14 +251,6 @@ def means(motion: Motion, values: ArrayLike, seconds: float) -> Array:
     """Means over so many seconds, (T,)."""
     window = np.ones(round(seconds * motion.rate))
     return np.convolve(np.asarray(values, float), window / len(window))[: len(motion.u)]
-
-
-def coarsely_explained(motion: Motion, model: Model) -> float:
-    """What the model explains of the means over `COARSE` seconds."""
-    velocity = means(motion, motion.velocity, COARSE)
-    error = velocity - means(motion, expected_velocity(motion, model), COARSE)
-    power = float(velocity @ velocity)
-    return 1 - float(error @ error) / power if power else 0.0
 
 
 def reach(motion: Motion) -> Array:
@@ -316,71 +308,63 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
             yield f"{wanted} in all recordings or in none, got some in {brief(report.opposite)}"
 
 
-Check = tuple[Any, str]  # what must be true for the words to be told, and these words
+Check = tuple[Any, str, str, str]  # if it holds: the place, what was expected there, what it got
 
 
 def causes(name: str, r: JointReport) -> Iterator[Check]:
     """Why commands do not explain a motion; the first that holds is the one to look at."""
-    told = f"motion at so many times the speed of others {r.follows}"
     doubt = "is it an angle to the ground? Then take differences of both angles"
-    yield r.follows, f"q_{name}: expected rest without commands, got {told}: {doubt}"
-    got = f"got motion by u_{r.other}: are columns mixed up?"
-    yield r.other, f"{name}: expected motion by u_{name}, {got}"
+    got = f"motion at so many times the speed of others {r.follows}: {doubt}"
+    yield r.follows, f"q_{name}", "rest without commands", got
+    yield r.other, name, f"motion by u_{name}", f"motion by u_{r.other}: are columns mixed up?"
     got = f"steps of {r.step:.3g} rad (of the encoder, or noise): {r.explained:.0%} of single"
-    wanted = f"q_{name}: expected angles finer than the motion in a tick"
+    got = f"{got} ticks and {r.coarse:.0%} of {COARSE} s are explained"
     noise = r.coarse > max(r.explained + COARSER, LEAST_EXPLAINED)
-    yield noise, f"{wanted}, got {got} ticks and {r.coarse:.0%} of {COARSE} s are explained"
-    wanted = f"{name}: expected {LEAST_EXPLAINED:.0%} of its motion by its commands"
-    yield r.explained < LEAST_EXPLAINED, f"{wanted}, got {r.explained:.0%}"
-    wanted = f"{name}: expected motion within {LATEST} s of its commands"
-    yield r.delay > LATEST - 1e-9, f"{wanted}, got it later: another clock?"
+    yield noise, f"q_{name}", "angles finer than the motion in a tick", got
+    wanted = f"{LEAST_EXPLAINED:.0%} of its motion by its commands"
+    yield r.explained < LEAST_EXPLAINED, name, wanted, f"{r.explained:.0%}"
+    wanted = f"motion within {LATEST} s of its commands"
+    yield r.delay > LATEST - 1e-9, name, wanted, "it later: another clock?"
 
 
 def lacks(name: str, r: JointReport) -> Iterator[Check]:
     """What nets could not learn from a log."""
     got = f"recordings in which it rests (engine or pump off, or blocked?): {brief(r.still)}"
-    wanted = f"{name}: expected commands to move it"
-    yield (
-        r.still and not r.other,
-        f"{wanted}, got {got}; the figures are those of the others, if any",
-    )
-    yield r.rest, f"u_{name}: expected 0 at rest, got {r.rest:.3g}"
-    wanted = f"u_{name}: expected commands of many sizes, because nets cannot guess what is between"
-    yield r.one_size, f"{wanted}, got one in each direction"
+    got = f"{got}; the figures are those of the others, if any"
+    yield r.still and not r.other, name, "commands to move it", got
+    yield r.rest, f"u_{name}", "0 at rest", f"{r.rest:.3g}"
+    wanted = "commands of many sizes, because nets cannot guess what is between"
+    yield r.one_size, f"u_{name}", wanted, "one in each direction"
     few = round(r.minutes, 1) < LEAST_MINUTES
-    yield few, f"{name}: expected {LEAST_MINUTES:g} minutes, got {r.minutes:.1f}"
+    yield few, name, f"{LEAST_MINUTES:g} minutes", f"{r.minutes:.1f}"
 
 
 def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
     """Where a log contradicts the machine that it should be of."""
     joint = machine.joints[machine.names.index(name)]
-    width, got = joint.q_max - joint.q_min, f"got {r.low:.2f} to {r.high:.2f}"
+    width, got = joint.q_max - joint.q_min, f"{r.low:.2f} to {r.high:.2f}"
     low, high = np.deg2rad([r.low, r.high])
     turned = min(beyond(low, high, joint), beyond(-high, -low, joint)) < BEYOND * width
     doubt = f"in degrees (--map {name}=COLUMN:deg, or -deg)" if turned else "another zero or joint"
     outside = beyond(r.low, r.high, joint) > BEYOND * width
-    yield outside, f"q_{name}: expected {joint.q_min:g} to {joint.q_max:g}, {got}: {doubt}?"
+    yield outside, f"q_{name}", f"{joint.q_min:g} to {joint.q_max:g}", f"{got}: {doubt}?"
     narrow = r.high - r.low < LEAST_RANGE * width
-    yield narrow, f"{name}: expected {LEAST_RANGE:.0%} of its range or more, {got}"
+    yield narrow, name, f"{LEAST_RANGE:.0%} of its range or more", got
+    if r.explained <= LEAST_EXPLAINED:
+        return
     apart = np.abs(np.subtract(r.dead_zone, joint.dead_zone)).max() > ZONE
     worse = 1 - r.by_zones > WORSE * (1 - r.explained)
-    wanted = f"{name}: expected the machine's dead_zone {joint.dead_zone}"
-    explained = r.explained > LEAST_EXPLAINED
-    yield (
-        explained and apart and worse,
-        f"{wanted}, got ({r.dead_zone[0]:.2f}, {r.dead_zone[1]:.2f})",
-    )
+    got = "({:.2f}, {:.2f})".format(*r.dead_zone)
+    yield apart and worse, name, f"the machine's dead_zone {joint.dead_zone}", got
     speeds = joint.q_dot_up, joint.q_dot_down
     ratio = np.array(r.fastest) / speeds
     slow = (ratio < SLOWER) & (np.array(r.largest) > AT_LIMIT * machine.pwm_limit / PWM_MAX)
-    wanted = (
-        f"{name}: expected the machine's q_dot_up and q_dot_down {speeds} as the fastest motion"
-    )
-    fastest = f"({r.fastest[0]:.3g}, {r.fastest[1]:.3g})"
-    yield explained and (slow | (ratio > FASTER)).any(), f"{wanted}, got {fastest} rad/s"
+    wanted = f"the machine's q_dot_up and q_dot_down {speeds} as the fastest motion"
+    got = "({:.3g}, {:.3g}) rad/s".format(*r.fastest)
+    yield (slow | (ratio > FASTER)).any(), name, wanted, got
     memory = machine.history * machine.dt
-    wanted = f"history: expected more than delay and lag of {name}, {r.delay:.2f} and {r.tau:.2f} s"
-    yield explained and r.delay + r.tau > memory, f"{wanted}, got {memory:.2f} s"
+    wanted = f"more than delay and lag of {name}, {r.delay:.2f} and {r.tau:.2f} s"
+    yield r.delay + r.tau > memory, "history", wanted, f"{memory:.2f} s"
 
 
 def beyond(low: float, high: float, joint: Joint) -> float:
@@ -400,9 +384,11 @@ def warnings(
         if name not in reports:
             yield f"{name}: expected commands in the log, got none"
     for name, r in reports.items():
-        yield from [text for holds, text in causes(name, r) if holds][:1]
+        first = [check for check in causes(name, r) if check[0]][:1]
         known = differences(name, r, machine) if machine else ()
-        yield from (text for holds, text in (*lacks(name, r), *known) if holds)
+        for holds, place, wanted, got in (*first, *lacks(name, r), *known):
+            if holds:
+                yield f"{place}: expected {wanted}, got {got}"
 
 
 def repeated(recordings: Sequence[Recording], others: Sequence[Recording]) -> list[str]:
@@ -411,17 +397,13 @@ def repeated(recordings: Sequence[Recording], others: Sequence[Recording]) -> li
     A table may have rounded them. What does not move is no recording that counts.
     """
     every, twins = [*others, *recordings], []
-    sums = np.array([(len(one.u), one.u.sum(), one.q.sum()) for one in every])
+    sums = np.array([(one.u.size, one.u.sum(), one.q.sum()) for one in every])
     for i, one in enumerate(recordings, len(others)):
         near = np.flatnonzero((np.abs(sums[:i] - sums[i]) < 1e-5 * one.u.size).all(axis=1))
-        same = (all(map(close, every[k][1:3], one[1:3])) for k in near if sums[k, 0] == sums[i, 0])
+        alike = [every[k] for k in near if every[k].u.shape == one.u.shape]
+        same = (np.allclose(other[1:3], one[1:3], rtol=0, atol=1e-5) for other in alike)
         twins += [one.name] if any(same) and moving(one).any() else []
     return twins
-
-
-def close(a: Array, b: Array) -> bool:
-    """Do two arrays of one shape have the same numbers, but for rounding?"""
-    return bool((np.abs(a - b) < 1e-5).all())
 
 
 def table(reports: Mapping[str, JointReport]) -> Iterator[str]:

@@ -57,7 +57,16 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """
     require(log.rate == net.rate, "rate", f"{net.rate}", log.rate)
     samples = join_recordings(log)
-    result = _one_step_scores(net, samples)
+    starts = samples.starts(net.history, 1, 1)
+    wanted = f"a recording above {net.history + 1} samples"
+    require(len(starts) > 0, "log", wanted, samples.lengths[:9])
+    one_step = free_run(net, samples, starts, 1)[0][0] * net.rate
+    persistence = samples.q_dot[starts] - samples.target[starts]
+    result: dict[str, Any] = {name: {"free_run": {}} for name in net.joints}
+    for j, scores in enumerate(result.values()):
+        if (scored := samples.moves[starts, j]).any():
+            scores["one_step_rmse"] = _rms(one_step[scored, j])
+            scores["persistence_rmse"] = _rms(persistence[scored, j])
     for horizon in tqdm(HORIZONS, desc="score nets", unit="horizon", disable=None):
         ticks = round(horizon * net.rate)
         starts = samples.starts(net.history, ticks, ticks)
@@ -74,22 +83,6 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
                     "relative_error": _rms(v_error[:, scored, j]) / speed if speed else None,
                     "position_error_median": float(np.median(np.abs(q_error[-1, scored, j]))),
                 }
-    return result
-
-
-def _one_step_scores(net: ActuatorNet, samples: Samples) -> dict[str, Any]:
-    starts = samples.starts(net.history, 1, 1)
-    wanted = f"a recording above {net.history + 1} samples"
-    require(len(starts) > 0, "log", wanted, samples.lengths[:9])
-    error = free_run(net, samples, starts, 1)[0][0] * net.rate
-    persistence = samples.q_dot[starts] - samples.target[starts]
-    result: dict[str, Any] = {}
-    for j, name in enumerate(net.joints):
-        result[name] = {"free_run": {}}
-        scored = samples.moves[starts, j]
-        if scored.any():
-            result[name]["one_step_rmse"] = _rms(error[scored, j])
-            result[name]["persistence_rmse"] = _rms(persistence[scored, j])
     return result
 
 

@@ -29,12 +29,13 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
     """`env.reset` and `env.step` as Gymnasium's vector environment. Paper: Fig. 4
 
     `info["velocity_error"]` is |v_goal - v_tool| [m/s], and `info["new_goal"]` says where the goal
-    has changed since. Gymnasium explains `AutoresetMode` and `info["final_obs"]`; its vector
-    wrappers of observations accept NEXT_STEP. `max_episode_steps` counts ticks and stands for the
-    seconds of `config`. "rgb_array" renders the first machine. ValueError: a wrong argument.
+    has changed since. Gymnasium explains `AutoresetMode.SAME_STEP` and `info["final_obs"]`.
+    `max_episode_steps` counts ticks and stands for the seconds of `config`. "rgb_array" renders the
+    first machine. ValueError: a number that is not positive.
     """
 
     episodes: env.Episodes  # from the first reset on
+    one_tick = staticmethod(env.step)
 
     def __init__(
         self,
@@ -44,19 +45,14 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         config: TaskConfig = TASK,
         interface: Interface = PAPER,
         render_mode: str | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         max_episode_steps: int | None = None,
     ) -> None:
         require(num_envs > 0, "num_envs", "1 or more", num_envs)
-        require(isinstance(machine, Machine), "machine", "a Machine", machine)
-        require(isinstance(config, TaskConfig), "config", "a TaskConfig", config)
-        require(hasattr(plant, "step"), "plant", "reset and step", plant)
         if max_episode_steps is not None:
             require(max_episode_steps > 0, "max_episode_steps", "1 or more", max_episode_steps)
             config = replace(config, episode_s=max_episode_steps / machine.rate)
-        self.mode = AutoresetMode(autoreset_mode)
-        self.metadata = TaskEnv.metadata | {"autoreset_mode": self.mode}
-        self.metadata["render_fps"] = round(machine.rate)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(machine.rate)}
+        self.metadata |= {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.num_envs, self.render_mode = num_envs, render_mode
         self.task = env.Task(machine, plant, config, interface)
         mean, _ = interface.scale(machine)
@@ -64,36 +60,20 @@ class TaskVectorEnv(VectorEnv[Array, Array, Any]):
         self.single_action_space = Box(-1.0, 1.0, (len(machine.driven),), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.waiting = np.zeros(num_envs, bool)  # episodes that begin in the next step
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Draw new episodes for all machines, or where the option `reset_mask` is true."""
+        """Draw new episodes for all machines."""
         super().reset(seed=seed)
-        mask = (options or {}).get("reset_mask")
-        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
-        fits = mask.shape == (self.num_envs,) and mask.dtype == bool
-        fits = fits and bool(mask.any()) and (bool(mask.all()) or hasattr(self, "episodes"))
-        require(fits, "reset_mask", f"{self.num_envs} booleans", f"{mask.dtype} {mask.shape}")
-        if mask.all():
-            self.episodes = env.reset(self.task, self.np_random, self.num_envs)
-        else:
-            self.episodes = env.restart(self.task, self.np_random, self.episodes, mask)
-        self.waiting = self.waiting & ~mask
+        self.episodes = env.reset(self.task, self.np_random, self.num_envs)
         return self.episodes.obs, {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Bools, Bools, dict[str, Any]]:
         """One tick of all machines under actions (num_envs, n_driven)."""
         require(hasattr(self, "episodes"), "step", "a reset before the first step", "none")
         now = self.task, self.np_random, self.episodes, np.asarray(actions)
-        one_tick = env.step if self.mode == AutoresetMode.SAME_STEP else env.tick
-        self.episodes, reward, terminated, truncated, info = one_tick(*now)
-        if (begin := self.waiting).any():
-            self.episodes = env.restart(self.task, self.np_random, self.episodes, begin)
-            reward = np.where(begin, 0.0, reward)
-            terminated, truncated = terminated & ~begin, truncated & ~begin
-        self.waiting = (terminated | truncated) & (self.mode == AutoresetMode.NEXT_STEP)
+        self.episodes, reward, terminated, truncated, info = self.one_tick(*now)
         return self.episodes.obs, reward, terminated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
@@ -111,8 +91,8 @@ class TaskEnv(gymnasium.Env[Array, Array]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        options |= {"autoreset_mode": AutoresetMode.DISABLED}
         self.vector = TaskVectorEnv(1, *arguments, **options)
+        self.vector.one_tick = env.tick
         self.metadata, self.render_mode = self.vector.metadata, self.vector.render_mode
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space

@@ -5,18 +5,11 @@ from pathlib import Path
 
 import torch
 
+from brokk_min import env
 from brokk_min._files import whole_file
+from brokk_min.beyond import interface
 from brokk_min.learning.policy import INTERFACES, Policy, contract
 from brokk_min.ppo import mlp
-
-OBSERVATION = (
-    "each number less mean, over scale, newest samples last: goal and measured velocity of the "
-    "tool [m/s], angles of locked joints [rad or m]; interface paper: histories of angles and of "
-    "velocities of each driven joint, then of its command for each driven joint [of full command]; "
-    "interface beyond: smoothed angles of driven joints, newer halves of the histories of their "
-    "velocities, then commands, then open indicators, resolved velocities of goal and integral, "
-    "see brokk_min/beyond/interface.py"
-)
 
 
 def export_onnx(path: Path, policy: Policy) -> None:
@@ -40,7 +33,8 @@ def export_onnx(path: Path, policy: Policy) -> None:
     assert program is not None
     mean, scale = INTERFACES[policy.interface].scale(policy.machine)
     told = contract(policy.machine, policy.interface) | {"interface": policy.interface}
-    told |= {"mean": mean.tolist(), "scale": scale.tolist(), "observation": OBSERVATION}
+    tables = (env if policy.interface == "paper" else interface).__doc__  # of the observation
+    told |= {"mean": mean.tolist(), "scale": scale.tolist(), "observation": tables}
     told["action"] = "of pwm_limit / 127 of each driven joint, cut at 1 and rounded to counts"
     told["geometry_columns"] = ["a", "alpha", "d", "theta", "q_min", "q_max", "kind"]  # m and rad
     program.model.metadata_props.update({name: json.dumps(value) for name, value in told.items()})

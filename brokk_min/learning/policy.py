@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -105,13 +106,10 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         require(fits, str(path), f"the machine's scale of {header['interface']}", "another")
         own = {"mean", "scale", *(f"layer_{i}" for i in range(8))}
         weights = tuple(arrays[f"layer_{i}"] for i in range(8))
-        size = len(mean)
-        for i in range(0, 8, 2):
-            outputs = len(machine.driven) if i == 6 else weights[i + 1].size
-            for k, shape in ((i, (size, outputs)), (i + 1, (outputs,))):
-                got = weights[k].shape
-                require(got == shape, f"layer_{k}", f"an array {shape}", got)
-            size = outputs
+        sizes = [len(mean), *(b.size for b in weights[1:7:2]), len(machine.driven)]
+        shapes = [shape for a, b in pairwise(sizes) for shape in ((a, b), (b,))]
+        for i, (shape, weight) in enumerate(zip(shapes, weights, strict=True)):
+            require(weight.shape == shape, f"layer_{i}", f"an array {shape}", weight.shape)
         of_net = {name: array for name, array in arrays.items() if name not in own}
         net = select_nets(machine, net_from_arrays(path, header["net"], of_net))
         return Policy(machine, header["training"], weights, net, header["interface"])

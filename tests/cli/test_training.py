@@ -10,7 +10,7 @@ from helpers_cli import run
 from helpers_machines import short_axes, small_net
 
 from brokk_min._files import SHIPPED
-from brokk_min.evaluation import progress, sequences
+from brokk_min.evaluation import baselines, sequences
 from brokk_min.evaluation.rollout import title
 from brokk_min.identification.net_file import fingerprint, save_net
 from brokk_min.learning import checkpoint
@@ -39,7 +39,7 @@ def test_train__has_its_settings_from_the_line(
     """Without --actuator on the nets of the package; the policy's row is beside the PIDs'."""
     short = short_axes(60, 1)
     monkeypatch.setattr(sequences, "axis_sequences", lambda machine: short)
-    monkeypatch.setattr(progress, "SECONDS", 0.5)
+    monkeypatch.setattr(baselines, "LOOK_SECONDS", 0.5)
     monkeypatch.chdir(tmp_path)
     net = small_net(BROKK_170, np.random.default_rng(0))
     save_net(tmp_path / "net.npz", net)

@@ -10,7 +10,6 @@ from helpers_machines import Idle, obedient_net, pids
 from brokk_min.actuator import PLANT
 from brokk_min.beyond.strong_pid import StrongPID
 from brokk_min.evaluation import baselines
-from brokk_min.evaluation.progress import beside_pids
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.jacobian import Gains, JacobianController
 from brokk_min.machine import BROKK_170
@@ -96,7 +95,7 @@ def test_beside_pids__measures_on_motions_that_no_pid_was_tuned_on():
     start, goals = tuning_set(BROKK_170, 16, 1, 10.0)
     standing = np.linalg.norm(goals, axis=-1).mean()
     idle = {name: Idle() for name in (baselines.BY_HAND, baselines.OPTIMISED)}
-    said = beside_pids(BROKK_170, idle)(Idle())
+    said = baselines.beside_pids(BROKK_170, idle)(Idle())
     pids = f"the PID tuned by hand has {standing:.4f}, the optimised one {standing:.4f}"
     assert said == f"{standing:.4f} m/s; {pids}"
     assert not {*map(tuple, start)} & {*map(tuple, tuning_set(BROKK_170, 16, 0, 10.0)[0])}

@@ -108,6 +108,8 @@ def test_evaluate__gives_rows_in_order_with_their_figures():
 
 def test_mean_interval__of_one_value_or_equal_ones_or_none():
     one = m.mean_interval(np.array([1.0]))
+    three = m.mean_interval(np.array([1.0, 2.0, 3.0]))
+    assert [round(x, 3) for x in three.values()] == [2.0, -0.484, 4.484]
     assert one == {"mean": 1.0, "low": None, "high": None} and m.interval_text(one) == "1"
     assert m.interval_text({"mean": 0.5, "low": 0.5, "high": 0.5}) == "0.5000"
     assert m.interval_text(dict.fromkeys(one)) == "not measured"
