@@ -15,7 +15,7 @@ from brokk_min.actuator import cylinder_speeds, hydraulics_of
 from brokk_min.evaluation import adaptive, baselines, metrics, report, reproduce
 from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.claims import TEXTS
-from brokk_min.evaluation.reproduce import Budget
+from brokk_min.evaluation.reproduce import Budget, variations
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import read_starts, task_sequences
 from brokk_min.identification.logs import read_log
@@ -36,6 +36,16 @@ def coarse_png(figure):
     return PNG(figure)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_robustness():
+    """Few drives warm up, and the chain measures robustness on the machine itself alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adaptive, "DRIVES", 2)
+        patch.setattr(adaptive, "PARTS", 1)
+        patch.setattr(reproduce, "variations", lambda machine: {"nominal": machine})
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """What one run of the chain wrote, in one process."""
@@ -43,7 +53,6 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reproduce, "side_by_side", one_by_one)
         patch.setattr(report, "png", coarse_png)
-        patch.setattr(adaptive, "DRIVES", 2)
         reproduce.reproduce(COARSE, out, TINY, 3)
     return out
 
@@ -56,7 +65,6 @@ def results(folder):
 def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, capsys):
     """The second time by its command, as `--quick`, in several processes."""
     monkeypatch.setattr(reproduce, "QUICK", TINY)
-    monkeypatch.setattr(adaptive, "DRIVES", 2)
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
     (tmp_path / "m.py").write_text(
         "from dataclasses import replace\nfrom brokk_min.actuator import hydraulics_of\n"
@@ -115,7 +123,7 @@ def test_reproduce__results_hold_every_run_and_a_verdict_on_each_sentence(folder
 
 
 def test_variations__change_what_they_say():
-    result, speeds = reproduce.variations(BROKK_170), cylinder_speeds(BROKK_170)
+    result, speeds = variations(BROKK_170), cylinder_speeds(BROKK_170)
     assert len(result) == 8 and result["nominal"] is BROKK_170
     assert hydraulics_of(result["supply flow -70 %"]).pump_flow == pytest.approx(0.000315)
     assert hydraulics_of(result["delay +50 ms"]).delay == pytest.approx(0.09)
@@ -126,7 +134,8 @@ def test_variations__change_what_they_say():
         np.testing.assert_allclose(result[name].dead_zones, np.full((5, 2), zone))
 
 
-def test_robustness__has_a_row_for_each_variation_and_controller():
+def test_robustness__has_a_row_for_each_variation_and_controller(monkeypatch):
+    monkeypatch.setattr(reproduce, "variations", variations)
     net = obedient_net(BROKK_170)
     pid = pids(BROKK_170, net)["jacobian_pid_ff_integral"]
     task = {"idle": Idle(), "pid": pid}, short_axes(20, 2)[2:], np.tile(POSE, (2, 1)), 0
@@ -135,11 +144,11 @@ def test_robustness__has_a_row_for_each_variation_and_controller():
     kinds = [f"{name}{start}" for start in ("", "+cold", "+warm") for name in ("idle", "pid")]
     assert sorted(table["nominal"]) == sorted(kinds)
     further = ["goals +50 %", "no sensor noise", "twice the sensor noise"]
-    assert list(table) == [*reproduce.variations(BROKK_170), *further]
+    assert list(table) == [*variations(BROKK_170), *further]
     for name, noise in zip(further[1:], (0.0, 0.1), strict=True):
         noisy, _ = metrics.evaluate(BROKK_170, *task, noise=noise)
         assert table[name]["pid"] == metrics.means(noisy)["pid"]["all"][ERROR]
-    runs, _ = metrics.evaluate(reproduce.variations(BROKK_170)["delay +50 ms"], *task)
+    runs, _ = metrics.evaluate(variations(BROKK_170)["delay +50 ms"], *task)
     error = metrics.by_start(runs, "pid", "all", ERROR)
     assert table["delay +50 ms"]["pid"] == metrics.mean_interval(error)
     errors = {name: row["pid"]["mean"] for name, row in table.items()}
