@@ -4,8 +4,8 @@
     python -m benchmarks.deviations --train
 
 Each function returns the figures of one entry of docs/deviations.md, and the name of an entry
-prints that entry alone. D4 and D5 train policies, for some five minutes. `benchmarks.ladder` has
-what the parts of our agent are worth in other learners.
+prints that entry alone. D4, D5, D10, D11 and D14 train policies, for some eight minutes.
+`benchmarks.ladder` has what the parts of our agent are worth in other learners.
 """
 
 import sys
@@ -21,7 +21,7 @@ from numpy.linalg import norm
 
 from benchmarks import POLICY, ladder
 from brokk_min import jacobian, kinematics, machine
-from brokk_min.actuator import PLANT, estimate_velocity
+from brokk_min.actuator import PLANT, ActuatorNet, estimate_velocity
 from brokk_min.beyond import interface
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.env import terminated
@@ -166,10 +166,9 @@ def levels() -> Figures:
 # --- by training ----------------------------------------------------------------------------------
 
 
-def train() -> Figures:
+def train(net: ActuatorNet, muon: bool = True) -> Figures:
     """Figures of `benchmarks.ladder` of a new policy, on the nets and on the plant."""
-    net = policy.load_policy(POLICY, M).net
-    recipe = find_recipe()
+    recipe = replace(find_recipe(), muon=muon)
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=STEPS))
     trained = ladder.train(net, recipe, 0)
     result = {}
@@ -180,13 +179,15 @@ def train() -> Figures:
 
 
 def trained() -> Figures:
-    """D4, D5: our agent, without the one and the other cost, and with the newest angles alone."""
-    changes: dict[str, Any] = {"TRAVEL_COST": 0.0, "EFFORT_COST": 0.0}
-    changes["smooth_angles"] = lambda _, history: history[..., 0, -1]
-    result = {f"ours, {name}": value for name, value in train().items()}
+    """D4, D5, D10, D11, D14: our agent; without a cost, a wider start, smooth angles, or Muon."""
+    changes: dict[str, Any] = {"TRAVEL_COST": 0.0, "EFFORT_COST": 0.0, "INTEGRAL_COST": 0.0}
+    changes |= {"WIDER": 1.0, "smooth_angles": lambda _, history: history[..., 0, -1]}
+    net = policy.load_policy(POLICY, M).net  # before the changes, which it would refuse
+    result = {f"ours, {name}": value for name, value in train(net).items()}
+    result |= {f"by Adam, {name}": value for name, value in train(net, muon=False).items()}
     for what, new in changes.items():
         with mock.patch.object(interface, what, new):
-            result |= {f"changed {what}, {name}": value for name, value in train().items()}
+            result |= {f"changed {what}, {name}": value for name, value in train(net).items()}
     return result
 
 
