@@ -6,6 +6,7 @@ Each file has the frames of a drive's log, and after each tick what the program 
 """
 
 import sys
+import zlib
 from collections import deque
 from dataclasses import replace
 from itertools import count
@@ -19,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # if it runs as a program
 from helpers_bus import World, baseline, unchanged
 from helpers_faults import FAULTS
 
-from brokk_min.can.canopen import OPERATOR_INPUT, Frame, OperatorInput
+from brokk_min.can.canopen import LATENESS, OPERATOR_INPUT, Frame, OperatorInput
 from brokk_min.can.connection import Bus
 from brokk_min.can.drive_log import read_frames
 from brokk_min.hw import Drive
@@ -83,16 +84,21 @@ class Operator:
 
 
 class Again:
-    """An operator whose inputs were recorded, each in seven bytes."""
+    """An operator whose inputs were recorded."""
 
     def __init__(self, frames):
-        self.rows = (frame.data for frame in frames if frame.id == OPERATOR_INPUT and frame.sent)
+        rows = (frame.data for frame in frames if frame.id == OPERATOR_INPUT and frame.sent)
+        self.inputs = iter([unpack(data) for data in rows])
 
     def __call__(self, driving, ready):
         self.told = [driving, ready]
-        data = next(self.rows)
-        x, y, z = (np.frombuffer(data[:6], "<i2") / 1e4).tolist()
-        return OperatorInput((x, y, z), *(bool(data[6] >> bit & 1) for bit in range(3)))
+        return next(self.inputs)
+
+
+def unpack(data):
+    """The operator's input of seven bytes."""
+    x, y, z = (np.frombuffer(data[:6], "<i2") / 1e4).tolist()
+    return OperatorInput((x, y, z), *(bool(data[6] >> bit & 1) for bit in range(3)))
 
 
 class Fallible:
@@ -132,9 +138,22 @@ def state_of(drive):
         "was it armed": gate.armed_once,
         "switch": gate.enable,
         "driving and ready, as the operator was told": drive.operator.told,
+        "operator's input": list(drive.operator_input.pack()),
         "command [counts]": np.rint(127 * gate.sent[..., -1]).astype(int),
         "place of a still encoder": gate.place,
+        "time": np.rint(1e6 * gate.time),
     }
+
+
+def digests(frames):
+    """A number for all that was read until the end of each tick."""
+    number, found = 0, []
+    for frame in frames:
+        if frame.id == LATENESS and frame.sent:
+            found.append(number)
+        elif not frame.sent:
+            number = zlib.crc32(bytes([*divmod(frame.id, 256), *frame.data]), number)
+    return np.array(found)
 
 
 class Replay(Bus):
@@ -192,20 +211,22 @@ def load(name):
     return frames, told
 
 
-def replay(name, frames, told):
+def replay(name, frames, told, changes=None):
     """Drive by the frames; AssertionError: the first difference, with its tick and field."""
     differences, machine = [], MACHINES[name]
     bus = Replay(frames, differences)
-    drive = Drive(machine, Fallible(machine, changes_of(name)), bus, Again(frames))
+    controller = Fallible(machine, changes_of(name) | (changes or {}))
+    drive = Drive(machine, controller, bus, Again(frames))
+    read = digests(frames)
     try:
         drive.begin()
     except ValueError as error:
         differences.append(f"setting up the nodes: {error}")
-    for tick in range(len(told["counts"])):
+    for tick in range(len(told["time"])):
         assert not differences, f"tick {tick}, {differences[0]}"
         drive.tick()
         assert not differences, f"tick {tick}, {differences[0]}"
-        for field, value in state_of(drive).items():
+        for field, value in (state_of(drive) | {"what was read": read[tick]}).items():
             wanted = told[field][tick]
             assert np.array_equal(value, wanted), f"tick {tick}, {field}: {wanted}, got {value}"
     assert not bus.frames, f"tick {tick}, frame: recorded {bus.frames[0]}, sent none"
@@ -220,18 +241,24 @@ def test_recorded_drive__replays_bit_for_bit(name):
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_recorded_drive__fails_on_any_other_byte_with_tick_and_field(name):
-    """Of a frame of the program, or the lowest byte of a position that it read."""
     frames, told = load(name)
     rng = np.random.default_rng(0)
-    own = [k for k, f in enumerate(frames) if f.sent and f.id != OPERATOR_INPUT]
-    places = [(k, i) for k in own for i in range(len(frames[k].data))]
-    places += [(k, 0) for k, f in enumerate(frames) if 0x180 < f.id < 0x18A]
+    places = [(k, i) for k, frame in enumerate(frames) for i in range(len(frame.data))]
     for k, i in rng.permutation(places)[:12]:
         data = bytearray(frames[k].data)
         data[i] ^= 1 << rng.integers(8)
         other = [*frames[:k], frames[k]._replace(data=bytes(data)), *frames[k + 1 :]]
         with pytest.raises(AssertionError, match=r"^tick \d+, \S.*: "):
             replay(name, other, told)
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_recorded_drive__fails_on_a_command_of_one_count_more(name):
+    frames, told = load(name)
+    for call in (20, 25, 45, 75):
+        moved = {call: lambda u: np.where(np.abs(u) > 1 / 127, u - np.sign(u) / 127, u)}
+        with pytest.raises(AssertionError, match=r"^tick \d+, frame 0x..., byte [0-4]: recorded"):
+            replay(name, frames, told, moved)
 
 
 def record(name, folder):
@@ -264,6 +291,7 @@ def record(name, folder):
             "frame size": np.array([len(frame.data) for frame in frames], np.uint8),
             "frame data": np.array([[*frame.data.ljust(8, b"\0")] for frame in frames], np.uint8),
             "frame sent": [frame.sent for frame in frames],
+            "what was read": digests(frames),
         },
         **told,
     )

@@ -154,6 +154,36 @@ def test_faults__of_encoders_by_hand(kind):
     assert beats[18:] == [{1, 2, 3, 4, 5, CONTROLLER}, *4 * [alive], alive | {3}]
 
 
+@pytest.mark.parametrize(
+    ("kind", "counts", "reasons"),
+    [
+        ("off", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
+        ("stuck", [0, 0, 0, 0], ["valve frame with counter 2 after 2"]),
+        ("garbage", [0, 0, 0, 0], [MALFORMED]),
+        ("wrong", [0, 0, 0, 0], [MALFORMED]),
+        ("slow", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
+        ("delayed", [42, 43, 44, 45], []),
+        ("intermittent", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
+        ("ok", [43, 44, 45, 46], []),
+    ],
+)
+def test_faults__of_the_valve_controller_by_hand(kind, counts, reasons):
+    """Commands in force after each tick, and why the valve controller stopped first."""
+    faults = parse_fault(BROKK_170, f"valves:{kind}@0.15")
+    machine = FaultyMachine(BROKK_170, START, 0.0, Recorder(), faults)
+    machine.receive(Frame(0.0, 0x000, b"\1\0"))
+    found = []
+    for k in range(7):
+        now = 0.05 * k + 0.01
+        machine.advance(now)
+        machine.receive(Frame(now, 0x080, b""))
+        u = np.array([(40 + k) * (k > 0), 0, 0, 0, 0]) / 127
+        machine.receive(Frame(now, 0x210, valve_frame(u, k, 1).tobytes()))
+        found.append(round(127 * machine.u[0]))
+    assert found == [0, 41, 42, *counts]
+    assert machine.reasons[:1] == reasons
+
+
 @pytest.mark.parametrize("text", ["stuck", "stuck@", "stuck@-1", "broken@1", "q9:stuck@1", "@1"])
 def test_parse_fault__refuses_what_it_does_not_know(text):
     refusal = r"--fault: expected \[NAME:\]KIND@SECONDS, a name of .* 'valves'\], a kind of .* got "

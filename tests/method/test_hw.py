@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from helpers_bus import START, ConstantCommand, HoldingOperator, World, raises, recording
-from helpers_faults import COMMAND, FAULTS, NOT_FOUND, fail, flood, measure, stall
+from helpers_faults import COMMAND, FAULTS, NOT_FOUND, fail, flood, foreign, measure, stall
 from helpers_machines import DRIVEN, obedient_net, pids
 
 from brokk_min._files import SHIPPED
@@ -81,6 +81,16 @@ def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     turned = np.diff(goals, axis=0, prepend=0).any(axis=1)
     half_second = np.convolve(turned, np.ones(10))[: len(turned)] > 0
     assert expected[half_second].mean() < 0.99  # there was something to lose
+
+
+def test_tick__survives_an_operator_that_fails_at_once(world):
+    """The first tick has a fault of its own before any other."""
+    world.drive.operator = raises(OSError("unplugged"))
+    assert world.drive.tick()
+    assert world.drive.reason == "error (OSError: unplugged)" and not world.drive.gate.armed_once
+    world.drive.operator = world.operator
+    world.run(0.3)
+    assert world.drive.gate.driving and world.drive.reason == ""
 
 
 def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later():
@@ -183,6 +193,15 @@ def test_tick__finds_positions_later_than_20_ms(late, found, world, monkeypatch)
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
     assert closes_within(world, begun, 0.175) == bool(found)
+
+
+def test_tick__takes_the_answers_after_a_position_before_sync(world):
+    """It is a fault of one tick; in the next the answers are heard again."""
+    world.run(0.6)
+    foreign(world, 0x185, bytes(4))
+    world.run(0.2)
+    assert world.drive.reason == "fault: q5: position before SYNC"
+    assert world.drive.gate.active_fault == ""
 
 
 def test_tick__leaves_a_fault_by_a_new_edge_only(world):
