@@ -82,7 +82,9 @@ def manipulability(J: ArrayLike) -> Array:
 
 
 def nakamura_damping(w: ArrayLike, w0: float, k: float) -> Array:
-    """lambda^2 = k (1 - w/w0)^2 [m^2] for w < w0, else 0 (Nakamura, 1986). Paper: Sec. 4.2
+    """lambda^2 = k (1 - w/w0)^2 [m^2] for w < w0, else 0 (Nakamura and Hanafusa, 1986).
+
+    Paper: Sec. 4.2
 
     >>> nakamura_damping([0.0, 0.5, 1.0, 2.0], 1.0, 0.1)
     array([0.1  , 0.025, 0.   , 0.   ])

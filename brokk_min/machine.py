@@ -37,6 +37,8 @@ def python_numbers(value: Any, place: str = "") -> None:
         plain = np.asarray(found).tolist()
         if field.type is int:
             require(isinstance(plain, int), place + field.name, "a whole number", found)
+        if field.type is str:
+            require(isinstance(plain, str), place + field.name, "a text", found)
         if field.type is float:
             finite = isinstance(plain, int | float) and bool(np.isfinite(plain))
             require(finite, place + field.name, "a finite number", found)
@@ -153,6 +155,8 @@ class Machine:
             require(slower > 0, f"{j.name}.q_dot_up, q_dot_down", "positive numbers", slower)
             known = j.kind in ("revolute", "prismatic")
             require(known, f"{j.name}.kind", "revolute or prismatic", j.kind)
+            signed = j.encoder_sign in (-1, 1)
+            require(signed, f"{j.name}.encoder_sign", "-1 or 1", j.encoder_sign)
             require(j.q_min < j.q_max, f"{j.name}.q_max", f"above {j.q_min}", j.q_max)
         nodes = [*(joint.encoder_node for joint in self.joints), self.controller_node]
         for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):

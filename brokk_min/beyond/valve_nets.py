@@ -10,7 +10,8 @@ nets by 0.0181 m/s and on the machine by 0.0177 m/s; on nets as printed it has 0
 (`benchmarks.deviations d7`).
 
 Who was first: the mu law is ITU-T G.711 (1972); inverting a dead zone before identification is
-common practice (Tao and Kokotovic, Adaptive Control of Systems with Actuator Nonlinearities, 1996).
+common practice (Tao and Kokotovic, Adaptive Control of Systems with Actuator and Sensor
+Nonlinearities, 1996).
 
 It plugs into `actuator.ActuatorNet.inputs`; `identification.fitting` trains it.
 """

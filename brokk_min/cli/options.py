@@ -112,6 +112,9 @@ def find_plant(name: str, machine: Machine) -> Plant:
     ValueError: no plant, or one that reports degrees, stands still or obeys the wrong way.
     """
     if name == "analytic":
+        if machine.hydraulics is None:
+            what = "--plant: expected one of your own, or net, got a machine without hydraulics"
+            print(f"{what}: those of the analytic plant are made up", file=sys.stderr)
         return PLANT
     plant: Plant = load_object("--plant", name)
     low, high = machine.column("q_min"), machine.column("q_max")

@@ -98,7 +98,10 @@ class Train(Training):
             rivals: dict[str, Controller] = {policy.name: policy, **pids}
             runs, _ = metrics.evaluate(machine, rivals, commands, starts, self.seed)
             print(table(runs))
-        print(f"{self.out}: trained; curve in {self.out}.csv; `brokk-min play --policy {self.out}`")
+        hint = f"--policy {self.out}"
+        if machine != BROKK_170:
+            hint += f" --machine {self.machine}"
+        print(f"{self.out}: trained; curve in {self.out}.csv; `brokk-min play {hint}`")
 
 
 @dataclass(kw_only=True)

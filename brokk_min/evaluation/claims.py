@@ -27,17 +27,22 @@ SHORT = {ERROR: "error", DRIFT: "drift"}  # in columns
 def claim(name: str, numbers: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any]:
     """A sentence of `claims.toml` with its verdicts, by what is judged, as in `results.json`.
 
-    It holds where all `numbers` of what is judged are beyond its limit, with their intervals.
+    It holds where all `numbers` of what is judged are beyond its limit, with their intervals, and
+    does not where one is not, with its interval. Else it is undecided.
     """
     text = TEXTS[name]
-    side, end = ("above", "low") if "above" in text else ("below", "high")
+    side, sign = ("above", 1) if "above" in text else ("below", -1)
     verdicts = {}
     for judged, row in numbers.items():
-        ends = np.array([number[end] for number in row.values()], float)  # nan: no interval
-        beyond = ends > text[side] if side == "above" else ends < text[side]
-        verdicts[judged] = "holds here" if beyond.all() else "does not hold here"
+        ends = np.array([(number["low"], number["high"]) for number in row.values()], float)
+        beyond = sign * ends > sign * text[side]  # (numbers, 2)
         if np.isnan(ends).any():
             verdicts[judged] = "was not measured"
+        elif beyond.all():
+            verdicts[judged] = "holds here"
+        else:
+            refuted = (~beyond).all(axis=1).any()
+            verdicts[judged] = "does not hold here" if refuted else "is undecided here"
     measured = f"{text['measure']}, to be {side} {text[side]:g}"
     known = {"figure": text["figure"], "paper": text["paper"], "measured": measured}
     return known | {"numbers": numbers, "verdicts": verdicts}

@@ -91,6 +91,15 @@ def test_task_claims__on_error_are_of_each_sequence_and_figure(x, z, drift, expe
     assert numbers["drift along z"]["mean"] == pytest.approx(drift - 0.2)
 
 
+@pytest.mark.parametrize(
+    ("drift", "expected"), [(0.040, TRUE), (0.0489, "is undecided here"), (0.052, FALSE)]
+)
+def test_claim__is_undecided_where_the_limit_is_within_the_interval(drift, expected):
+    """The means of six starts are 0.001 m more, with an interval of 0.0009 m to each side."""
+    still, *_ = claims.task_claims(runs_with({}, {PPO: drift, HIGH: 0.0, LOW: 0.0, RAW: 0.0}))
+    assert verdict(still, PPO) == expected
+
+
 def test_verdict_rows__compare_with_the_optimised_pid_alone():
     """Of the policies that have runs; each of the paper's sentences on motion is there."""
     runs = runs_with({PPO: 0.01, HIGH: 0.02}, {})

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,6 +45,8 @@ BAD = [
     ({"history": 13.0}, "history: expected a whole number, got 13.0"),
     ({"joint": 3, "dead_zone": 0.1}, "q4.dead_zone: expected a pair, up and down, got 0.1"),
     ({"joint": 3, "kind": "screw"}, "q4.kind: expected revolute or prismatic, got screw"),
+    ({"joint": 1, "encoder_sign": 0}, "q2.encoder_sign: expected -1 or 1, got 0"),
+    ({"name": Path("mini")}, "name: expected a text, got mini"),
     ({"joint": 2, "q_dot_up": 0.0}, "q3.q_dot_up, q_dot_down: expected positive numbers, got 0.0"),
     ({"joint": 4, "dead_zone": (0.07, 80 / 127)}, "dead_zone: expected 0 to 80/127, got [[0.07"),
     ({"joint": 4, "dead_zone": (-0.01, 0.07)}, "dead_zone: expected 0 to 80/127, got [[0.07"),
