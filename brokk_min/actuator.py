@@ -72,6 +72,15 @@ HYDRAULICS = {"brokk170": Hydraulics(BROKK_CYLINDERS, pump_flow=0.00105)}  # m^3
 
 
 @lru_cache
+def stands_in(machine: Machine) -> bool:
+    """Whether the analytic plant moves this machine by default hydraulics, as it has none.
+
+    >>> stands_in(BROKK_170)
+    False
+    """
+    return machine.hydraulics is None
+
+
 def hydraulics_of(machine: Machine) -> Hydraulics:
     """The hydraulics of a machine, by default plain ones.
 

@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from brokk_min._files import NEW, SHIPPED, brief, expected
-from brokk_min.actuator import PLANT, ActuatorNet, Plant
+from brokk_min.actuator import PLANT, ActuatorNet, Plant, stands_in
 from brokk_min.evaluation.baselines import Baselines, read_gains
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX, Machine, require
@@ -112,7 +112,7 @@ def find_plant(name: str, machine: Machine) -> Plant:
     ValueError: no plant, or one that reports degrees, stands still or obeys the wrong way.
     """
     if name == "analytic":
-        if machine.hydraulics is None:
+        if stands_in(machine):
             what = "--plant: expected one of your own, or net, got a machine without hydraulics"
             print(f"{what}: those of the analytic plant are made up", file=sys.stderr)
         return PLANT
