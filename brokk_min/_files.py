@@ -135,7 +135,7 @@ def expected(path: Path, what: str) -> Iterator[None]:
         yield
     except (OSError, MemoryError):
         raise
-    except Exception as error:  # zipfile, zlib, json and NumPy raise anything on damaged files
+    except (Exception, SystemExit) as error:  # zlib, NumPy, a user's file: they raise anything
         told = str(error) if ": expected " in str(error) else f"expected {what}, got {brief(error)}"
         raise ValueError(f"{path}: {told.removeprefix(f'{path}: ')}") from error
 

@@ -13,7 +13,15 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brokk_min.machine import PWM_MAX, Array, Machine, by_direction, require, valve_opening
+from brokk_min.machine import (
+    PWM_MAX,
+    Array,
+    Machine,
+    by_direction,
+    python_numbers,
+    require,
+    valve_opening,
+)
 
 
 class Plant(Protocol):
@@ -39,6 +47,10 @@ class Cylinder:
     area: float = 0.005  # m^2, of the piston
     speed: tuple[float, float] | None = None  # m/s up, down at full command; None: by `q_dot_up`
 
+    def __post_init__(self) -> None:
+        """ValueError: a field that is no number."""
+        python_numbers(self, "Cylinder.")
+
 
 @dataclass(frozen=True)
 class Hydraulics:
@@ -59,6 +71,10 @@ class Hydraulics:
     valve_threshold: float = 0.80  # activation below which a valve is closed
     spool_threshold: float = 0.01  # of full stroke, above which a valve activates
 
+    def __post_init__(self) -> None:
+        """ValueError: a field that is no number."""
+        python_numbers(self, "Hydraulics.")
+
 
 BROKK_CYLINDERS = {  # all assumed
     # base, rod [m]  angle [rad]  area [m^2]  speed up, down [m/s]
@@ -71,7 +87,6 @@ BROKK_CYLINDERS = {  # all assumed
 HYDRAULICS = {"brokk170": Hydraulics(BROKK_CYLINDERS, pump_flow=0.00105)}  # m^3/s; assumed
 
 
-@lru_cache
 def stands_in(machine: Machine) -> bool:
     """Whether the analytic plant moves this machine by default hydraulics, as it has none.
 
@@ -81,6 +96,7 @@ def stands_in(machine: Machine) -> bool:
     return machine.hydraulics is None
 
 
+@lru_cache
 def hydraulics_of(machine: Machine) -> Hydraulics:
     """The hydraulics of a machine, by default plain ones.
 
@@ -90,11 +106,12 @@ def hydraulics_of(machine: Machine) -> Hydraulics:
     >>> hydraulics_of(BROKK_170).pump_flow
     0.00105
     """
-    h = machine.hydraulics or Hydraulics()
+    h = Hydraulics() if machine.hydraulics is None else machine.hydraulics
     if isinstance(h, str):
         require(h in HYDRAULICS, "hydraulics", f"one of {[*HYDRAULICS]}, or a value", h)
         h = HYDRAULICS[h]
     else:
+        require(isinstance(h, Hydraulics), "hydraulics", "actuator.Hydraulics", h)
         known = set(h.cylinders) <= set(machine.names)
         require(known, "cylinders", f"those of joints {[*machine.names]}", [*h.cylinders])
     for joint in machine.joints:
@@ -105,9 +122,10 @@ def hydraulics_of(machine: Machine) -> Hydraulics:
         low, high = cylinder.angle + joint.q_min, cylinder.angle + joint.q_max
         closes = cylinder.base == 0 or 0 < low < high < np.pi
         require(closes, f"{joint.name}.angle", "angles in (0, pi)", f"{low:.3f} to {high:.3f}")
+    require(min(h.delay, *h.gain) >= 0, "hydraulics", "delay and gain of 0 or more", h)
     fastest = min(h.tau_spool, h.tau_cylinder, h.tau_valve_up, h.tau_valve_down)
     steps = machine.dt / h.dt
-    fits = abs(steps - round(steps)) < 1e-6 and h.dt <= fastest  # explicit Euler
+    fits = abs(steps - round(steps)) < 1e-6 and 0 < h.dt <= fastest  # explicit Euler
     require(fits, "hydraulics.dt", "a whole part of 1/rate, not above any tau", h.dt)
     return h
 

@@ -37,6 +37,8 @@ def python_numbers(value: Any, place: str = "") -> None:
         plain = np.asarray(found).tolist()
         if field.type is int:
             require(isinstance(plain, int), place + field.name, "a whole number", found)
+        if field.type is bool:
+            require(isinstance(plain, bool), place + field.name, "True or False", found)
         if field.type is str:
             require(isinstance(plain, str), place + field.name, "a text", found)
         if field.type is float:
@@ -148,6 +150,12 @@ class Machine:
     def __post_init__(self) -> None:
         """ValueError: what cannot be a machine, with the field, what is wanted and what it got."""
         python_numbers(self)
+        drives = any(getattr(joint, "driven", False) for joint in self.joints)
+        require(drives, "joints", "a Joint that is driven, or more", self.joints)
+        slower = min(self.rate, self.tool_speed)
+        require(slower > 0, "rate, tool_speed", "positive numbers", slower)
+        bits = self.encoder_bits
+        require(1 <= bits <= 32, "encoder_bits", "1 to 32", bits)
         for j in self.joints:
             pair = np.shape(j.dead_zone) == (2,)
             require(pair, f"{j.name}.dead_zone", "a pair, up and down", j.dead_zone)
@@ -159,6 +167,7 @@ class Machine:
             require(signed, f"{j.name}.encoder_sign", "-1 or 1", j.encoder_sign)
             require(j.q_min < j.q_max, f"{j.name}.q_max", f"above {j.q_min}", j.q_max)
         nodes = [*(joint.encoder_node for joint in self.joints), self.controller_node]
+        require(all(1 <= node <= 127 for node in nodes), "CANopen nodes", "1 to 127", nodes)
         for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):
             require(len(set(values)) == len(values), "joints", f"different {what}", values)
         limit, zones, samples = self.pwm_limit, self.dead_zones, self.velocity_samples

@@ -62,7 +62,8 @@ class DriveMachine(Command):
 
     def __call__(self, machine: Machine) -> None:
         new = None if self.valves and self.valves.exists() else self.valves
-        self.writes(self.log, new, reads=[Path(self.command)])
+        used = default_policy(machine, self.policy) if self.controller != "jog" else ()
+        self.writes(self.log, new, reads=[Path(self.command), *used])
         learns = self.adapt or self.shadow
         check(learns or not self.valves, "--valves", "--adapt or --shadow with it", self.valves)
         nets = self.controller != "jog" or not (self.adapt or self.valves)

@@ -3,6 +3,7 @@
 import os
 import runpy
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -75,12 +76,17 @@ class Command:
         """
         outputs = [path for path in paths if path]
         options = (x if isinstance(x, tuple) else (x,) for x in vars(self).values())
-        inputs = [x for x in (*chain(*options), *reads) if isinstance(x, Path)]
+        sources = [Path(x.rpartition(":")[0]) for x in vars(self).values() if ".py:" in str(x)]
+        inputs = [x for x in (*chain(*options), *sources, *reads) if isinstance(x, Path)]
         inputs = [x.resolve() for x in inputs if not any(x is path for path in outputs)]
         for i, path in enumerate(outputs):
-            folder, target = path.parent, path.resolve()
-            fits = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
-            check(fits, str(path), "a file in an existing, writable folder", "none")
+            target = path.resolve()
+            usable = path.is_file() or not path.exists()  # no folder, and no device
+            try:
+                tempfile.TemporaryFile(dir=target.parent).close()
+            except OSError:
+                usable = False
+            check(usable, str(path), "a file in an existing, writable folder", "none")
             once = target not in inputs + [one.resolve() for one in outputs[:i]]
             check(once, str(path), "a name of its own", "that of another file of this command")
             check(self.force or not path.exists(), str(path), "no file (or --force)", "one")
@@ -97,7 +103,9 @@ def load_object(option: str, name: str) -> Any:
     try:
         found = runpy.run_path(path)
     except (Exception, SystemExit) as error:  # whatever the file does
-        raise ValueError(f"{option}: expected {path} to run, got {brief(error)}") from error
+        moved = " (CHANGELOG.md has what moved)" if "unexpected keyword" in str(error) else ""
+        got = f"{brief(error)}{moved}"
+        raise ValueError(f"{option}: expected {path} to run, got {got}") from error
     finally:
         os.chdir(before)  # paths are those of the shell, wherever the file goes
         sys.path.remove(folder)
@@ -116,19 +124,43 @@ def find_plant(name: str, machine: Machine) -> Plant:
             what = "--plant: expected one of your own, or net, got a machine without hydraulics"
             print(f"{what}: those of the analytic plant are made up", file=sys.stderr)
         return PLANT
-    plant: Plant = load_object("--plant", name)
+    plant = OwnPlant(name, load_object("--plant", name))
     low, high = machine.column("q_min"), machine.column("q_max")
     q = np.tile((low + high) / 2, (machine.n, 1))
     u = machine.pwm_limit / PWM_MAX * np.eye(machine.n)
-    with expected(Path(name), "a plant whose states have angles q"):  # whatever the file does
-        state = plant.reset(machine, q.copy())
-        for _ in range(round(2 * machine.rate)):
-            state = plant.step(machine, state, u)
-        moved = np.diag(np.reshape(state.q, q.shape) - q)
+    state = plant.reset(machine, q.copy())
+    for _ in range(round(2 * machine.rate)):
+        state = plant.step(machine, state, u)
+    moved = np.diag(np.asarray(state.q) - q)
     fits = np.all((moved > 0.005) & (moved < 1.5 * (high - low)))  # not in degrees
     wanted = "each joint to go up in 2 s of the largest command"
     require(bool(fits), name, wanted, f"{moved.round(3)} rad")
     return plant
+
+
+@dataclass(frozen=True)
+class OwnPlant:
+    """A plant of the user's file, whose every state is looked at. Errors are ValueErrors."""
+
+    name: str
+    plant: Plant
+
+    def reset(self, machine: Machine, q: Any) -> Any:
+        """The plant at rest at angles `q` [rad] (..., n)."""
+        return self.checked("reset", np.shape(q), machine, q)
+
+    def step(self, machine: Machine, state: Any, u: Any) -> Any:
+        """One tick under the held command `u` [-1, 1] (..., n)."""
+        return self.checked("step", np.shape(state.q), machine, state, u)
+
+    def checked(self, method: str, shape: tuple[int, ...], *arguments: Any) -> Any:
+        """ValueError: whatever the file does, or a state without finite angles of this shape."""
+        with expected(Path(self.name), "a plant whose states have angles q"):
+            state = getattr(self.plant, method)(*arguments)
+            q = np.asarray(state.q, float)
+            require(q.shape == shape, "angles q of a state", f"an array {shape}", q.shape)
+            require(bool(np.isfinite(q).all()), "angles q of a state", "finite numbers", brief(q))
+        return state
 
 
 def default_policy(machine: Machine, policy: Path | None) -> tuple[Path, Path | None]:

@@ -77,7 +77,7 @@ class Train(Training):
         recipe = self.recipe()
         from brokk_min.learning.checkpoint import train_policy
 
-        self.writes(self.out)
+        self.writes(self.out, None if self.resume else Path(f"{self.out}.csv"))
         checkpoint = Path(f"{self.out}.checkpoint")
         try:
             checkpoint.touch(exist_ok=self.resume)  # the name is taken, for other trainings

@@ -42,7 +42,7 @@ def metrics(machine: Machine, trace: Trace, goals: Array, start: Array) -> dict[
     m, m/s, m/s^3; valve travel in full strokes; reward 1. `goals` [m/s] (T, num, 3), `start`
     tool positions before the first tick [m] (num, 3). Errors are transient in the first second
     after a change of goal, and steady in the rest (Kunapuli et al., RSS 2025, arXiv 2506.17832);
-    nan where a run has none.
+    nan where a run has none; a curve has no drift, see `line_distance`.
     """
     error = norm(goals - trace.v_tool, axis=-1)
     transient = after_a_change(machine, goals)
@@ -81,21 +81,25 @@ def line_distance(p_tool: Array, goals: Array, start: Array) -> Array:
     """Distance of the tool from the commanded line [m], (T, num).
 
     The line starts where the tool was when the goal's direction last changed; to stop or to go back
-    is no change. `p_tool` are positions at the end of each tick [m] (T, num, 3), others as above.
+    is no change. A goal that turns in two ticks running is on a curve, off which nothing drifts:
+    nan. `p_tool` are positions at the end of each tick [m] (T, num, 3), others as above.
     """
     origin = start  # of the line
     direction = np.zeros_like(start)  # of the line; 0 before the first motion
+    turned = np.zeros((len(start), 1), bool)
     distance = []
     for p_before, p, goal in zip([start, *p_tool[:-1]], p_tool, goals, strict=True):
         speed = norm(goal, axis=-1, keepdims=True)
         heading = goal / np.maximum(speed, 1e-12)
         first = ~direction.any(axis=-1, keepdims=True)
+        turned_before = turned
         turned = norm(np.cross(direction, heading), axis=-1, keepdims=True) > 1e-6
         origin = np.where((speed > 0) & turned, p_before, origin)
         direction = np.where((speed > 0) & (turned | first), heading, direction)
         from_origin = p - origin
         along = np.sum(from_origin * direction, axis=-1, keepdims=True) * direction
-        distance.append(norm(from_origin - along, axis=-1))
+        off_line = norm(from_origin - along, axis=-1)
+        distance.append(np.where((turned & turned_before)[:, 0], np.nan, off_line))
     return np.array(distance)
 
 

@@ -50,7 +50,7 @@ def load_known(path: Path, machine: Machine, net: ActuatorNet) -> Known:
     with expected(path, "estimates of valves that `drive --adapt` wrote"):
         content = json.loads(path.read_text("utf-8"))
         wanted = {"machine": machine.name, "nets": fingerprint(net)}
-        expect_same(str(path), wanted, {name: content[name] for name in wanted})
+        expect_same(path, content, wanted)
         known = Known(*(np.array([content[name]], float) for name in Known._fields))
         shapes = [[*of.shape] for of in unknown((1, len(machine.driven)))]
         require([[*of.shape] for of in known] == shapes, "A, b, seconds", str(shapes), "others")

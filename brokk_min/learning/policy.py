@@ -109,7 +109,9 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         sizes = [len(mean), *(b.size for b in weights[1:7:2]), len(machine.driven)]
         shapes = [shape for a, b in pairwise(sizes) for shape in ((a, b), (b,))]
         for i, (shape, weight) in enumerate(zip(shapes, weights, strict=True)):
-            require(weight.shape == shape, f"layer_{i}", f"an array {shape}", weight.shape)
+            fits = weight.shape == shape and weight.dtype == np.float32
+            got = f"{weight.dtype} {weight.shape}"
+            require(fits, f"layer_{i}", f"an array float32 {shape}", got)
         of_net = {name: array for name, array in arrays.items() if name not in own}
         net = select_nets(machine, net_from_arrays(path, header["net"], of_net))
         return Policy(machine, header["training"], weights, net, header["interface"])

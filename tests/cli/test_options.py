@@ -19,15 +19,19 @@ DIGGER = replace(BROKK_170, name=NAME)
 NUMBER = 3
 
 class Own(AnalyticPlant):
-    def __init__(self, sign=1.0, scale=1.0):
-        self.sign, self.scale = sign, scale
+    def __init__(self, sign=1.0, scale=1.0, joints=5, ends=1e9):
+        self.sign, self.scale, self.joints, self.ends = sign, scale, joints, ends
 
     def step(self, machine, state, u):
         import beside_it_late
+        self.ends -= 1
+        if self.ends < 0:
+            raise SystemExit(0)
         state = super().step(machine, state, self.sign * u)
-        return state._replace(q=self.scale * state.q)
+        return state._replace(q=self.scale * state.q[..., : self.joints])
 
 OWN, REVERSED, BROKEN, DEGREES = Own(), Own(-1.0), Own(scale=float("nan")), Own(scale=57.3)
+FEWER, ENDS = Own(joints=4), Own(ends=60)
 """
 
 
@@ -80,6 +84,17 @@ def test_writes__refuses_a_name_for_two_files_before_the_work(tmp_path, monkeypa
         with pytest.raises(WrongUse, match="expected a name of its own, got that of another file"):
             command.writes(command.out, command.json, reads=[Path("d")])
     command.writes(Path("e"), command.json)
+    with pytest.raises(WrongUse, match=r"m.py: expected a name of its own"):
+        Reads(machine="m.py:M", force=True).writes(Path("m.py"))
+
+
+def test_writes__refuses_what_is_no_file_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "nowhere").symlink_to(tmp_path / "missing" / "file")
+    for name in ("folder", "nowhere", "missing/file", "/dev/full"):
+        with pytest.raises(WrongUse, match=f"{name}: expected a file in an existing, writable"):
+            Command(force=True).writes(Path(name))
 
 
 def test_find_plant__tries_each_joint(file):
@@ -89,11 +104,17 @@ def test_find_plant__tries_each_joint(file):
     for name, message in {
         "NUMBER": "expected a plant .* got 'int' object has no attribute 'reset'",
         "REVERSED": r"expected each joint to go up .* got \[-",
-        "BROKEN": r"expected each joint to go up .* got \[nan",
+        "BROKEN": "angles q of a state: expected finite numbers, got .*nan",
+        "FEWER": r"angles q of a state: expected an array \(5, 5\), got \(5, 4\)",
         "DEGREES": "expected each joint to go up",
     }.items():
         with pytest.raises(ValueError, match=message):
             find_plant(f"{file}:{name}", BROKK_170)
+    plant = find_plant(f"{file}:ENDS", BROKK_170)
+    state = plant.reset(BROKK_170, q)
+    with pytest.raises(ValueError, match=r":ENDS: expected a plant .* got SystemExit\(0\)"):
+        for _ in range(21):
+            state = plant.step(BROKK_170, state, 0 * q)
 
 
 def test_default_policy__is_the_packages_if_it_has_one():

@@ -67,6 +67,9 @@ def test_train__goes_on_only_if_it_is_told_to(tmp_path, capsys):
     assert "checkpoint: expected --resume or no checkpoint, got one" in capsys.readouterr().err
     assert run(f"{line} --resume") == 1
     assert "missing.npz: no such file" in capsys.readouterr().err
+    (tmp_path / "q.npz.csv").mkdir()
+    assert run(f"train --out {tmp_path}/q.npz --force") == 2
+    assert "q.npz.csv: expected a file in an existing" in capsys.readouterr().err
 
 
 def test_train__has_its_name_for_itself_while_it_runs(tmp_path, monkeypatch, capsys):

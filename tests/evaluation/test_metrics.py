@@ -20,13 +20,19 @@ from brokk_min.machine import BROKK_170
         ),
         ([[0.2, 0, 0], [0, 0.2, 0]], [[1.0, 0.1, 0], [1.2, 5.0, 0]], [0.1, 0.2]),
         ([[0.0, 0, 0], [0, 0, 0.1]], [[0.0, 0.3, 0.4], [0.1, 0.0, 7.0]], [0.5, 0.1]),
+        (  # round a curve
+            [[0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0], [0, 0.1, 0]],
+            [[1.0, 0, 0], [2.0, 1.0, 0.1], [2.0, 2.0, 0.2], [2.0, 3.0, 0.2]],
+            [0.0, 0.1, np.nan, 0.1],
+        ),
     ],
 )
 def test_line_distance__by_hand(goals, p_tool, expected):
     """A stop and the way back keep a line, a turn begins another; before, it is the start."""
     p, v = (np.stack([rows, np.zeros_like(rows)], axis=1, dtype=float) for rows in (p_tool, goals))
     result = m.line_distance(p, v, np.zeros((2, 3)))  # the second run rests meanwhile
-    assert result[:, 0] == pytest.approx(expected) and not result[:, 1].any()
+    np.testing.assert_allclose(result[:, 0], expected, atol=1e-12)
+    assert not result[:, 1].any()
 
 
 def test_metrics__by_hand():

@@ -113,7 +113,8 @@ BAD = [
     ({"cylinders": {"boom": Cylinder()}}, "cylinders: expected those of joints ['q1', 'q2', "),
     ({"cylinder": {"angle": 0.0}}, "q5.angle: expected angles in (0, pi), got 0.000 to 2.000"),
     ({"cylinder": {"angle": 1.2}}, "q5.angle: expected angles in (0, pi), got 1.200 to 3.200"),
-    *[({"dt": 0.02}, f"{DT}, got 0.02"), ({"rate": 30.0}, DT)],
+    ({"delay": -0.1}, "hydraulics: expected delay and gain of 0 or more, got Hydraulics("),
+    *[({"dt": 0.02}, f"{DT}, got 0.02"), ({"rate": 30.0}, DT), ({"dt": -0.005}, DT)],
     *(({f"tau_{x}": 0.004}, DT) for x in ("spool", "cylinder", "valve_up", "valve_down")),
 ]
 
@@ -130,6 +131,10 @@ def test_hydraulics__that_cannot_be_are_refused_by_name_before_anything_moves(ch
     assert str(caught.value).startswith(message)
     with pytest.raises(ValueError, match=r"hydraulics: expected one of .*, got brok"):
         PLANT.reset(replace(machine, name="typo", hydraulics="brok"), MIDDLE)
+    with pytest.raises(ValueError, match=r"hydraulics: expected actuator.Hydraulics, got \{\}"):
+        PLANT.reset(replace(machine, hydraulics={}), MIDDLE)
+    with pytest.raises(ValueError, match=r"Hydraulics.delay: expected a finite number, got nan"):
+        replace(BROKK, delay=float("nan"))
 
 
 def test_the_brokk__has_the_hydraulics_of_the_design():
