@@ -150,10 +150,17 @@ def expect_same(place: Path | str, found: Mapping[str, Any], wanted: Mapping[str
 
 
 def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
-    """The cells of a CSV by column, see `numbers`; ValueError: no such columns, or a short row."""
+    """The cells of a CSV by column, see `numbers`; ValueError: no such columns, or a short row.
+
+    Where semicolons separate the cells, commas are those of decimals.
+    """
     with expected(path, "a CSV table"):
         with open(path, newline="", encoding="utf-8-sig") as file:
-            header, *rows = csv.reader(file, strict=True)
+            semicolons = ";" in file.readline()
+            file.seek(0)
+            header, *rows = csv.reader(file, delimiter=";" if semicolons else ",", strict=True)
+        if semicolons:
+            rows = [[cell.replace(",", ".") for cell in row] for row in rows]
         names = [name.strip() for name in header]
         missing = [name for name in columns if name not in names]
         require(not missing, str(path), f"columns {missing}", brief(names))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]  # of any shape, float32 or float64
+LONGEST = 100  # m: no link is so long, but in millimetres most are
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
 
 
@@ -161,6 +162,8 @@ class Machine:
             require(pair, f"{j.name}.dead_zone", "a pair, up and down", j.dead_zone)
             slower = min(j.q_dot_up, j.q_dot_down)
             require(slower > 0, f"{j.name}.q_dot_up, q_dot_down", "positive numbers", slower)
+            longest = max(abs(j.a), abs(j.d))
+            require(longest < LONGEST, f"{j.name}.a, d", f"metres, below {LONGEST}", longest)
             known = j.kind in ("revolute", "prismatic")
             require(known, f"{j.name}.kind", "revolute or prismatic", j.kind)
             signed = j.encoder_sign in (-1, 1)

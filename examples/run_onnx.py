@@ -49,6 +49,8 @@ def tick(net, told, h, q, u, v_goal):
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     net, told = load(sys.argv[1])
     q = np.array([(low + high) / 2 for *_, low, high, _ in told["geometry"]])  # rad
     u, dt = 0 * q, 1 / told["rate"]

@@ -153,8 +153,8 @@ def parse_fault(machine: Machine, text: str) -> list[Fault]:
     """
     nodes = dict(zip([*machine.names, "valves"], canopen.node_numbers(machine)))
     what, _, seconds = text.partition("@")
-    name, _, kind = what.rpartition(":")
-    of = [nodes.get(name, -1)] if name else [joint.encoder_node for joint in machine.joints]
+    name, colon, kind = what.rpartition(":")
+    of = [nodes.get(name, -1)] if colon else [joint.encoder_node for joint in machine.joints]
     known = kind in KINDS and -1 not in of and seconds.replace(".", "", 1).isdecimal()
     wanted = f"[NAME:]KIND@SECONDS, a name of {[*nodes]}, a kind of {[*KINDS]}"
     require(known, "--fault", wanted, text)

@@ -58,6 +58,8 @@ class ReadsLogs(Command):
         The joints are in the order of the machine, of which locked ones may be missing.
         """
         check(len(paths) > 0, "LOGS", "one file or more", "none")
+        tables = not self.map or any(map(is_table, paths))
+        check(tables, "--map", "a table or a recording of ROS", paths[0])
         log = logs.join_logs({path: self.read_log(path, machine) for path in paths})
         known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
         if machine == BROKK_170 and set(log.joints) != set(known):
@@ -65,11 +67,9 @@ class ReadsLogs(Command):
         return logs.in_order(log, known), machine
 
     def read_log(self, path: Path, machine: Machine) -> Log:
-        """A table or a recording of ROS, else a log of a CAN bus."""
-        mapped = columns.parse_map(self.map)
+        """A table or a recording of ROS, else a log of a CAN bus, which needs no `map`."""
         if is_table(path):
-            return logs.read_log(path, machine, mapped, self.topics)
-        require(not mapped, "--map", "a table or a recording of ROS", path)
+            return logs.read_log(path, machine, columns.parse_map(self.map), self.topics)
         with expected(path, "a log"):
             return log_for_fit(machine, read_frames(path))
 

@@ -103,8 +103,11 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
     limit = 1.0 if command else LARGEST
     unread = np.isnan(result) & name.startswith("q_")
     for row in np.flatnonzero(~(np.abs(result) <= limit) & ~unread):  # also where it is nan
-        unit = f" (per cent: --map {name}=COLUMN:percent)" if command else ""
-        wanted = f"-{limit:g} to {limit:g}{unit}"
+        largest = np.nanmax(np.abs(result))
+        units = {100: "percent", 127: "0.00787", 255: "UNIT", 1000: "permille"}
+        unit = next((name for most, name in units.items() if largest <= most), "UNIT")
+        wanted = f"-{limit:g} to {limit:g}"
+        wanted += f" (another unit? --map {name}=COLUMN:{unit}; rest is 0)" if command else ""
         raise ValueError(f"row {row + 2}, column {name}: expected {wanted}, got {result[row]}")
     return result
 

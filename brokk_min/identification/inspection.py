@@ -28,9 +28,10 @@ LATEST = 0.6  # s, longest delay
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s
 ZONES = 0.01 * np.arange(61)  # dead zones, of full command
 AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
+AGAINST = 0.4  # least correlation with the other sign of what is expected
 PAUSE = 2.0  # s, after so long a joint without commands is at rest
 CLEAR_SIGN = 0.1  # least correlation that has a clear sign
-OPPOSITE = 0.4  # least correlation of a recording with the other sign
+OPPOSITE = 0.2  # the same of one recording; of sound ones of ours down to -0.11
 FASTEST = 0.999  # quantile of the speeds, because the single ones have noise
 COARSE = 0.5  # s
 CLEAR = 0.2  # of the fastest expected motion: more is clear
@@ -46,7 +47,9 @@ BEYOND = 0.05  # of a joint's range, outside of it
 FOLLOWS = 0.8  # of a joint's motion without commands, that another joint explains
 COARSER = 0.15  # more of the coarse motion is explained: angles have noise or steps
 ZONE = 0.04  # of full command, between the dead zones of machine and log
+EARLIER = 0.02  # more of a motion is explained if it begins before its commands
 WORSE = 1.25  # times as much is not explained with the machine's dead zones
+SMALL = 0.05  # of full command: no machine is driven by less
 FASTER, SLOWER = 1.2, 0.4  # of the machine's fastest motion, which are in the log
 AT_LIMIT = 0.95  # of the command limit: such commands should give the fastest motion
 
@@ -71,11 +74,12 @@ class JointReport(NamedTuple):
     step: float  # rad, by which its angle usually changes in a tick, if it does
     by_zones: float  # part that it explains with the machine's dead zones; 1 if these are unknown
     still: list[str]  # recordings in which commands do not move it; all else is without them
-    opposite: list[str]  # recordings in which it moves against the model of all of them
+    opposite: list[str]  # recordings in which the sign is not that of most of them
     follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
     other: str = ""  # the joint whose commands explain its motion
     rest: float = 0.0  # the command at which it rests, if that is clearly not 0
     one_size: bool = False  # are all commands in a direction of one size?
+    early: float = 0.0  # s, by which it moves before its commands, if that explains more
 
 
 def inspect(log: Log, machine: Machine | None = None) -> dict[str, JointReport]:
@@ -108,6 +112,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         still = np.array([stands_still(one, model, motion) for one in each])
         if still.all() or (still == before).all():
             break
+    turned = opposite(recordings, j, rate)
     q_dot = np.concatenate([one.q_dot[:, j] for one in kept])
     steps = np.abs(np.diff(q))
     by = {
@@ -134,23 +139,37 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         step=float(np.median(steps[steps > 0])) if steps.any() else 0.0,
         by_zones=best_lag(motion, np.array(zones)).explained if zones else 1.0,
         still=[one.name for one in compress(recordings, still)],
-        opposite=[a.name for a, b in zip(recordings, each) if contradicts(b, model)],
+        opposite=[
+            one.name
+            for one, of in zip(recordings, each)
+            if one.name in turned or contradicts(of, model)
+        ],
         follows={},
         other=other if by.get(other, 0) > LEAST_EXPLAINED else "",
         rest=rest_of(motion_of(list(log.recordings), j, rate, span)),
         one_size=one_size(u),
+        early=earlier(motion, model),
     )
 
 
-def sign(u: Array, q_dot: Array, rate: float) -> int:
+def sign(u: Array, q_dot: Array, rate: float, least: float = CLEAR_SIGN) -> int:
     """That of velocities (T,) under positive commands; 0: not clear.
 
     Both are means over a second, because fast sines fit reversed as well.
     """
     second = np.ones(round(rate)) / round(rate)
     agreement = np.convolve(u, second, "same") @ np.convolve(q_dot, second, "same")
-    clear = abs(agreement) > CLEAR_SIGN * np.linalg.norm(u) * np.linalg.norm(q_dot)
+    clear = abs(agreement) > least * np.linalg.norm(u) * np.linalg.norm(q_dot)
     return int(np.sign(agreement)) if clear else 0
+
+
+def opposite(recordings: Sequence[Recording], j: int, rate: float) -> list[str]:
+    """Names of the recordings in which joint `j` moves the other way than in most of them."""
+    driven = [one for one in recordings if np.ptp(one.u[:, j]) > COMMANDED]
+    signs = [sign(one.u[:, j], one.q_dot[:, j], rate, OPPOSITE) for one in driven]
+    fewer = -np.sign(sum(signs)) or 1
+    names = [one.name for one, way in zip(driven, signs) if way == fewer]
+    return names if -fewer in signs else []
 
 
 def followed_joints(log: Log, samples: Samples, j: int) -> dict[str, float]:
@@ -217,6 +236,17 @@ def best_lag(motion: Motion, zones: Array) -> Model:
     """The delay and lag that explain a motion best with these dead zones (2,)."""
     lags = product(range(round(LATEST * motion.rate) + 1), TAUS)
     return max((with_gains(motion, lag, zones) for lag in lags), key=lambda one: one.explained)
+
+
+def earlier(motion: Motion, model: Model) -> float:
+    """By how much a joint moves before its commands [s], where that explains it better."""
+    if model.lag[0]:
+        return 0.0
+    ahead = range(1, round(LATEST * motion.rate) + 1)
+    leads = [motion._replace(u=np.append(motion.u[i:], np.zeros(i))) for i in ahead]
+    parts = [best_lag(lead, model.zones).explained for lead in leads]
+    best = int(np.argmax(parts))
+    return ahead[best] / motion.rate if parts[best] > model.explained + EARLIER else 0.0
 
 
 def with_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> Model:
@@ -288,14 +318,15 @@ def rest_of(motion: Motion) -> float:
 def one_size(u: Array) -> bool:
     """Are the commands (T,) of a direction all as large as its largest, as those of a switch?"""
     sides = [side[side > COMMANDED] for side in (u, -u)]
-    return all((side > 0.98 * side.max()).mean() > 0.9 for side in sides if len(side))
+    switched = [(side > 0.98 * side.max()).mean() > 0.9 for side in sides if len(side)]
+    return bool(switched) and all(switched)
 
 
 def contradicts(motion: Motion, model: Model) -> bool:
     """Does a joint move against what the model expects of its commands?"""
     expected = expected_velocity(motion, model)
     size = np.linalg.norm(expected) * np.linalg.norm(motion.velocity)
-    return bool(expected @ motion.velocity < -OPPOSITE * size)
+    return bool(expected @ motion.velocity < -AGAINST * size)
 
 
 def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
@@ -316,6 +347,7 @@ def causes(name: str, r: JointReport) -> Iterator[Check]:
     doubt = "is it an angle to the ground? Then take differences of both angles"
     got = f"motion at so many times the speed of others {r.follows}: {doubt}"
     yield r.follows, f"q_{name}", "rest without commands", got
+    yield r.early, name, "motion after its commands", f"it {r.early:.2f} s before: another clock?"
     yield r.other, name, f"motion by u_{name}", f"motion by u_{r.other}: are columns mixed up?"
     got = f"steps of {r.step:.3g} rad (of the encoder, or noise): {r.explained:.0%} of single"
     got = f"{got} ticks and {r.coarse:.0%} of {COARSE} s are explained"
@@ -333,6 +365,9 @@ def lacks(name: str, r: JointReport) -> Iterator[Check]:
     got = f"{got}; the figures are those of the others, if any"
     yield r.still and not r.other, name, "commands to move it", got
     yield r.rest, f"u_{name}", "0 at rest", f"{r.rest:.3g}"
+    largest = max(r.largest)
+    wanted = "commands in parts of full command, up to 1"
+    yield largest < SMALL, f"u_{name}", wanted, f"at most {largest:.2g}: another unit?"
     wanted = "commands of many sizes, because nets cannot guess what is between"
     yield r.one_size, f"u_{name}", wanted, "one in each direction"
     few = round(r.minutes, 1) < LEAST_MINUTES
@@ -345,6 +380,7 @@ def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
     width, got = joint.q_max - joint.q_min, f"{r.low:.2f} to {r.high:.2f}"
     low, high = np.deg2rad([r.low, r.high])
     turned = min(beyond(low, high, joint), beyond(-high, -low, joint)) < BEYOND * width
+    turned &= r.high - r.low > width or max(-r.low, r.high) > 2 * np.pi  # else it would fit
     doubt = f"in degrees (--map {name}=COLUMN:deg, or -deg)" if turned else "another zero or joint"
     outside = beyond(r.low, r.high, joint) > BEYOND * width
     yield outside, f"q_{name}", f"{joint.q_min:g} to {joint.q_max:g}", f"{got}: {doubt}?"

@@ -20,6 +20,7 @@ FASTER = 2.0  # times the fastest motion, as in the safety gate: no joint does i
 USUAL = 4.0  # times the 90 % quantile of noise in steps, assumed: none is beyond it
 LASTS = 5  # rows, assumed: motion that lasts for three of them is real
 TOO_FAST = 10.0  # times the fastest motion of a machine, of one that is unknown 1 rad/s (assumed)
+TURN = 0.3  # rad, assumed: so near 2 pi a jump is a turn
 LEAST = 10  # fast steps, assumed, that tell how often a sensor is read
 
 
@@ -59,13 +60,20 @@ def jumps(time: Array, q: Array, fastest: float) -> NDArray[np.bool_]:
 
 
 def unread(time: Array, q: Array, fastest: float) -> NDArray[np.bool_]:
-    """Which angles (T,) were not read: what stands between two jumps for less than `MAX_GAP`."""
+    """Which angles (T,) were not read: what stands between two jumps for less than `MAX_GAP`.
+
+    Or does not move there, though the joint does elsewhere: without a value a sensor keeps one
+    that no joint could reach, such as 65535 counts.
+    """
     jump = jumps(time, q, fastest)
     if not jump.any():
         return jump
     between = np.cumsum(jump)  # number of jumps up to each row
     shortest = max(3 * rows_per_value(q), MAX_GAP / float(np.median(np.diff(time))))
-    return np.asarray(np.bincount(between)[between] < shortest)
+    begins = np.flatnonzero(np.diff(between, prepend=-1))
+    still = np.maximum.reduceat(q, begins) == np.minimum.reduceat(q, begins)
+    still &= not still.all()  # of a joint that moves
+    return np.asarray((np.bincount(between)[between] < shortest) | still[between])
 
 
 def check_run(
@@ -81,10 +89,18 @@ def check_run(
     rows = np.array([rows_per_value(angle) for angle in q.T])
     period = np.median(step) * rows  # s, of new angles
     slow = [name for name, dt in zip(joints, period, strict=True) if dt > 1.05 / rate]
-    wanted = f"new angles at the machine's {rate:g} Hz or more (if in ms: --map time=COLUMN:ms)"
+    units = {"ms": 1e3, "us": 1e6, "ns": 1e9}
+    fits = [unit for unit, of in units.items() if 1.05 / rate > period.max() / of > 1e-4]
+    doubt = f" (if in {fits[0]}: --map time=COLUMN:{fits[0]})" if fits else ""
+    wanted = f"new angles at the machine's {rate:g} Hz or more{doubt}"
     sensors = f"q of {brief(slow)}, one every {rows.max():g} rows"
     where = sensors if rows.max() > 1 else "column time"
     require(not slow, f"run {run}, {where}", wanted, f"{1 / period.max():.3g} Hz")
+    for name, angle in zip(joints, q.T, strict=True):
+        steps = np.nan_to_num(np.abs(np.diff(angle)))
+        turns = np.sum(np.abs(steps - 2 * np.pi) < TURN) * (np.quantile(steps, 0.9) < TURN)
+        wanted, got = "an angle that goes on beyond a turn", f"{turns} jumps by a turn: unwrap it"
+        require(turns < 2, f"run {run}, q_{name}", wanted, got)
     lag = len(q) // 20  # over so many rows neither noise nor single jumps count
     if lag > 1:
         speeds = np.nan_to_num(np.abs(q[lag:] - q[:-lag])) / (time[lag:] - time[:-lag])[:, None]

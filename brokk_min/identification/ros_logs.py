@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min._files import expected, require_package
+from brokk_min._files import brief, expected, require_package
 from brokk_min.machine import Array, require
 
 STATE = "sensor_msgs/msg/JointState"
@@ -47,7 +47,7 @@ def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], li
         q = [(t, joints_of(state, names)) for t, state in zip(times, states, strict=True)]
         u = [(t, joints_of(order, names)) for t, order in zip(u_times, orders, strict=True)]
         table = columns_of(q, u)
-    several = states and len(names) > len(states[0].name) and hasattr(orders[0], "data")
+    several = hasattr(orders[0], "data") and any([*state.name] != names for state in states)
     order = [f"{commands}: expected one order of the joints, took {names}"] if several else []
     return table, [*q_warnings, *u_warnings, *order, *old_commands(commands, table)]
 
@@ -69,7 +69,8 @@ def clock(topic: str, messages: list[tuple[float, Any]]) -> tuple[Array, list[st
 def joints_of(message: Any, names: list[str]) -> dict[str, float]:
     """Angles or commands by joint; ValueError: other numbers of them than of joints."""
     if hasattr(message, "data"):
-        require(len(message.data) == len(names), "commands", f"one of each {names}", message.data)
+        wanted = f"one of each {names} (a JointState says by itself which joints it has)"
+        require(len(message.data) == len(names), "commands", wanted, brief([*message.data]))
         return dict(zip(names, message.data, strict=True))
     filled = (x for x in (message.position, message.velocity, message.effort) if len(x))
     return dict(zip(message.name, next(filled, []), strict=True))

@@ -174,6 +174,8 @@ GOOD = JointReport(
             {"fastest": (0.2, 0.05), "largest": (0.1, 80 / 127)},
             ["q1: expected the machine's .* fastest motion, got .0.2, 0.05."],
         ),
+        ({"early": 0.2}, ["q1: expected motion after its commands, got it 0.20 s before: another"]),
+        ({"largest": (0.006, 0.0)}, ["u_q1: expected commands in parts of full command, up to 1"]),
         ({"opposite": ["x"]}, ["u_q1: expected positive commands to raise q_q1 in all"]),
         ({"sign": -1}, ["u_q1: expected positive commands to raise q_q1, got falling"]),
     ],

@@ -183,15 +183,32 @@ x,0.15,0.4,1.3
 SECOND_EARLIER = "run,time,u_a,q_a\nx,1.00,0,0\ny,7.00,0,0\nx,1.05,0,0\ny,7.05,0,0\nx,1.02,0,0\n"
 
 
+def test_read_log__takes_semicolons_with_decimal_commas(tmp_path):
+    (tmp_path / "a.csv").write_text(GOOD)
+    (tmp_path / "b.csv").write_text(GOOD.replace(",", ";").replace(".", ","))
+    one, other = (read_log(tmp_path / name, BROKK_170) for name in ("a.csv", "b.csv"))
+    np.testing.assert_equal(one.recordings, other.recordings)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (GOOD.replace(",", ";"), "columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got "),
+        (GOOD.replace(",", "|"), "columns: expected u_<joint> (--map u_NAME=COLUMN:UNIT), got "),
         ("run,u_a,q_a\nx,0,0\n", "columns: expected 'time' (--map time=COLUMN:UNIT), got ['run'"),
-        (GOOD.replace("0.3", "30"), "row 4, column u_a: expected -1 to 1 (per cent: --map u_a="),
+        (
+            GOOD.replace("0.3", "30"),
+            "row 4, column u_a: expected -1 to 1 (another unit? --map u_a=COLUMN:percent;",
+        ),
         (GOOD.replace("0.10", "0.05"), "run x, column time: expected stamps that rise, got a step"),
         (SECOND_EARLIER, "run x, column time: expected stamps that rise, got a step of -0.03 at 1"),
-        ("run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\n", "run x, column time: expected new angles at the"),
+        (
+            "run,time,u_a,q_a\nx,0,0,0\nx,50,0,0\n",
+            "run x, column time: expected new angles at the machine's 20 Hz or more (if in ms: --map",
+        ),
+        (
+            "run,time,u_a,q_a\n" + "".join(f"x,{i / 20},0,{0.2 * i % 6.283}\n" for i in range(120)),
+            "run x, q_a: expected an angle that goes on beyond a turn, got 3 jumps by a turn: unwrap",
+        ),
     ],
 )
 def test_read_log__names_file_and_place_of_what_is_wrong(tmp_path, text, message):

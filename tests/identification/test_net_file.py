@@ -53,7 +53,7 @@ def test_fingerprint__differs_between_nets():
 
 
 def machine_with(names):
-    joints = [replace(BROKK_170.joints[0], name=x, encoder_node=i) for i, x in enumerate(names)]
+    joints = [replace(BROKK_170.joints[0], name=x, encoder_node=i) for i, x in enumerate(names, 1)]
     return replace(BROKK_170, name="some", joints=tuple(joints), q_start=())
 
 

@@ -42,6 +42,7 @@ BAD = [
     ({"joint": 3, "q_min": NAN}, "q4.q_min: expected a finite number, got nan"),
     ({"joint": 3, "a": "1.15"}, "q4.a: expected a finite number, got 1.15"),
     ({"rate": INF}, "rate: expected a finite number, got inf"),
+    ({"joint": 1, "a": 1150.0}, "q2.a, d: expected metres, below 100, got 1150.0"),
     ({"rate": -25.0}, "rate, tool_speed: expected positive numbers, got -25.0"),
     ({"tool_speed": 0}, "rate, tool_speed: expected positive numbers, got 0"),
     ({"encoder_bits": 0}, "encoder_bits: expected 1 to 32, got 0"),
