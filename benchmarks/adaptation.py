@@ -19,6 +19,7 @@ import tyro
 from benchmarks import POLICY
 from brokk_min.actuator import PLANT, Cylinder, cylinder_speeds, hydraulics_of
 from brokk_min.beyond.adaptation import adapt
+from brokk_min.cli.options import own_controller
 from brokk_min.evaluation import adaptive, baselines, metrics, reproduce, sequences
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.machine import BROKK_170 as M
@@ -34,6 +35,7 @@ Schedule = Callable[[float], Machine]  # the machine at a time [s]
 class Options:
     starts: int = 8  # Start poses.
     machines: int = 24  # Unseen machines.
+    # Names in files of results, or FILE.py:NAME of your own, see examples/own_controller.py.
     controllers: tuple[str, ...] = ("rl", "rl_paper", baselines.STRONGEST, baselines.OPTIMISED)
 
 
@@ -137,13 +139,14 @@ def row(controller: Controller, name: str, net: Any, schedule: Schedule, task: A
 def main(options: Options) -> None:
     policies = {n: load_policy(POLICY.with_name(f), M) for n, f in POLICIES.items()}
     net = policies["rl"].net
-    each = {**policies, **baselines.read_gains(POLICY.with_name("gains.json"), M, net)}
+    each: dict[str, Controller] = {**policies, **baselines.read_gains(POLICY.with_name("gains.json"), M, net)}
     moves = sequences.axis_sequences(M)
     starts = sequences.draw_starts(M, options.starts, moves, SEED)
     task = moves, starts, adaptive.warm_up_motions(M)
     fixed = {name: (lambda t, of=of: of) for name, of in reproduce.variations(M).items()}
     drawn = unseen(options.machines)
     for name in options.controllers:
+        each[name] = each[name] if name in each else own_controller(name, M, net)
         print(f"\n| {name} | {' | '.join(COLUMNS)} |\n|---|---|---|---|---|---|")
         of_drawn = []
         for title, schedule in {**fixed, **changes(), **drawn}.items():

@@ -36,5 +36,5 @@ def test_chain__goes_from_a_recording_to_a_drive(tmp_path, monkeypatch):
     )
     policy = load_policy(tmp_path / "new" / "policy.npz", BROKK_170)
     assert policy.training["recipe"]["learner"]["total_steps"] == 3072
-    assert "PPO, our interface" in done.stdout and "strongest PID" in done.stdout
+    assert "PPO, our agent" in done.stdout and "strongest PID" in done.stdout
     assert any(frame.id == 0x210 for frame in read_frames(tmp_path / "new" / "drive.log"))

@@ -8,7 +8,14 @@ from pathlib import Path
 from brokk_min._files import require_package, write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.can.operator_input import read_commands
-from brokk_min.cli.options import Command, check, default_policy, find_plant, load_pids
+from brokk_min.cli.options import (
+    Command,
+    check,
+    default_policy,
+    find_plant,
+    load_pids,
+    own_controller,
+)
 from brokk_min.evaluation import adaptive, baselines, metrics, sequences
 from brokk_min.evaluation.rollout import title, valves_at_rest
 from brokk_min.jacobian import JacobianController
@@ -24,6 +31,7 @@ class Evaluate(Command):
     commands: Path | None = None  # Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
     plant: str = "analytic"  # What moves: analytic, net (of the policy), or FILE.py:NAME.
+    controller: str = ""  # Also one of your own: FILE.py:NAME, a function of machine and nets.
     json: Path | None = None  # Also write all runs here.
     save_gains: Path | None = None  # Tune the PIDs, even if there are gains; write them here.
     num_starts: int = 16  # Without --starts: how many of the machine's.
@@ -42,6 +50,8 @@ class Evaluate(Command):
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
         commands, starts = self.task(machine)
         controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
+        if self.controller:
+            controllers[self.controller] = own_controller(self.controller, machine, net)
         if self.adapt:
             rows, motions = len(commands) * len(starts), adaptive.warm_up_motions(machine)
             controllers |= adaptive.cold_and_warm(

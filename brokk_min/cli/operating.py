@@ -5,7 +5,7 @@ import struct
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from tyro.conf import Positional
@@ -17,7 +17,14 @@ from brokk_min.beyond.adaptation import Adaptive, valves
 from brokk_min.can.connection import open_bus
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
 from brokk_min.can.simulated_machine import parse_fault, run_machine
-from brokk_min.cli.options import Command, check, default_policy, find_plant, load_pids
+from brokk_min.cli.options import (
+    Command,
+    check,
+    default_policy,
+    find_plant,
+    load_pids,
+    own_controller,
+)
 from brokk_min.evaluation.baselines import OPTIMISED, baselines
 from brokk_min.evaluation.rollout import title
 from brokk_min.identification.valve_report import describe, load_known, save_known
@@ -51,7 +58,7 @@ class DriveMachine(Command):
     command: str = ""  # joystick, the default, or a CSV: sequence,time,vx,vy,vz [s, m/s].
     shadow: bool = False  # Send nothing: show what would be sent beside what others send.
     sync: bool = False  # With --shadow, send SYNC and start the nodes all the same.
-    controller: Literal["rl", "jacobian", "jog"] = "rl"  # Policy, optimised PID, one joint.
+    controller: str = "rl"  # Policy; or jacobian, optimised PID; jog, one joint; FILE.py:NAME.
     joint: str = ""  # Joint that jogs, forward and backward with x.
     counts: int = 12  # Its command, of 127; a little beyond the dead zone.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
@@ -88,7 +95,9 @@ class DriveMachine(Command):
     def find_controller(self, machine: Machine) -> Controller:
         """The controller that is named."""
         if self.controller != "jog":
-            found, net = find_controller(machine, self.policy, self.controller == "rl")
+            found, net = find_controller(machine, self.policy, self.controller != "jacobian")
+            if self.controller not in ("rl", "jacobian"):
+                found = own_controller(self.controller, machine, net)
             if not (self.adapt or self.shadow):
                 return found
             old = self.valves if self.valves and self.valves.exists() else None

@@ -17,7 +17,7 @@ from brokk_min._files import NEW, SHIPPED, brief, expected
 from brokk_min.actuator import PLANT, ActuatorNet, Plant, stands_in
 from brokk_min.evaluation.baselines import Baselines, read_gains
 from brokk_min.learning.policy import load_policy
-from brokk_min.machine import BROKK_170, PWM_MAX, Machine, require
+from brokk_min.machine import BROKK_170, PWM_MAX, Controller, Machine, require
 
 FRACTIONS = ("gamma", "gae_lambda", "zero_goals", "axis_goals", "noise", "weight_decay")
 
@@ -96,7 +96,8 @@ class Command:
 def load_object(option: str, name: str) -> Any:
     """The object NAME of `FILE.py:NAME`; the file is run, as `python FILE.py` would."""
     path, _, symbol = name.rpartition(":")
-    known = "analytic" if option == "--plant" else BROKK_170.name
+    usual = {"--plant": "analytic", "--controller": "a name of --help"}
+    known = usual.get(option, BROKK_170.name)
     check(path.endswith(".py"), option, f"{known} or FILE.py:NAME", name)
     folder, before = str(Path(path).resolve().parent), Path.cwd()
     sys.path.insert(0, folder)  # files beside it can be imported
@@ -161,6 +162,15 @@ class OwnPlant:
             require(q.shape == shape, "angles q of a state", f"an array {shape}", q.shape)
             require(bool(np.isfinite(q).all()), "angles q of a state", "finite numbers", brief(q))
         return state
+
+
+def own_controller(name: str, machine: Machine, net: ActuatorNet) -> Controller:
+    """What NAME(machine, nets of its driven joints) of `FILE.py:NAME` gives, see `Controller`."""
+    make = load_object("--controller", name)
+    with expected(Path(name), "a function of machine and nets that gives a Controller"):
+        controller: Controller = make(machine, net)
+        require(callable(controller.start), "start", "a method", controller.start)
+    return controller
 
 
 def default_policy(machine: Machine, policy: Path | None) -> tuple[Path, Path | None]:

@@ -18,7 +18,7 @@ TITLES = {  # of controllers in tables, figures and windows, by their names in f
     "rl_critic": "PPO as printed",
     "rl_critic_nets": "PPO with a critic, our nets",
     "rl_paper": "PPO by groups, the paper's observation",
-    "rl": "PPO, our interface",
+    "rl": "PPO, our agent",
     "jacobian_pid_ff_integral": "strongest PID",
 }
 
@@ -31,9 +31,11 @@ def title(name: str) -> str:
 
 
 def valves_at_rest(name: str) -> str:
-    """The class of a controller: "closed" valves while the tool rests, or "open" ones."""
-    closed = ("rl", "jacobian_pid_ff_integral")
-    return "closed" if name.partition("+")[0] in closed else "open"
+    """The class of a controller: valves "closed" while the tool rests, "open", or "-" (unknown)."""
+    plain = name.partition("+")[0]
+    if plain not in TITLES:
+        return "-"
+    return "closed" if plain in ("rl", "jacobian_pid_ff_integral") else "open"
 
 
 class Trace(NamedTuple):

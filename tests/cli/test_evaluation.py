@@ -1,6 +1,7 @@
 """The commands that compare, on small files: what they write, print and refuse."""
 
 import json
+from pathlib import Path
 
 import pytest
 from helpers_cli import run
@@ -38,6 +39,20 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
         assert f"{'strongest PID':56}{'closed':>15}{errors[-1][-1]:15.4g}" in printed
     assert len({*errors}) == 3
     assert evaluate(folder, f"--json {out}") == 2  # it is there
+
+
+def test_evaluate__takes_a_controller_of_ones_own(folder, capsys):
+    name = f"{Path(__file__).parents[2]}/examples/own_controller.py:PROPORTIONAL"
+    assert evaluate(folder, f"--controller {name} --json {folder}/own.json") == 0
+    runs = json.loads((folder / "own.json").read_text())["runs"]
+    own = next(run for run in runs if run["controller"] == name)
+    assert own["velocity_error_mean"] < 0.07 < runs[0]["velocity_error_mean"]  # it moves up
+    assert f"{name:56}{'-':>15}" in capsys.readouterr().out
+    (folder / "none.py").write_text("NUMBER = 3\n")
+    assert evaluate(folder, f"--controller {folder}/none.py:NUMBER") == 1
+    assert "NUMBER: expected a function of machine and nets" in capsys.readouterr().err
+    assert evaluate(folder, "--controller policy") == 2
+    assert "--controller: expected a name of --help or FILE.py:NAME" in capsys.readouterr().err
 
 
 def test_evaluate__tunes_pids_anew_and_again_by_what_the_file_says(folder, capsys, monkeypatch):

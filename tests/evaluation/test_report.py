@@ -28,7 +28,7 @@ def render(hours=1.0, machine="digger"):
     numbers = {c: {"mean": e, "low": e - 0.001, "high": e + 0.001} for c, e in ERRORS.items()}
     table = {c: dict.fromkeys(metrics.COLUMNS, number) for c, number in numbers.items()}
     results = {
-        "meta": {"machine": machine, "seed": 3, "effort": {"hours": hours}},
+        "meta": {"machine": machine, "seed": 3, "effort": {"hours": hours, "short_s": 3.0}},
         "table": table,
         "task_space": {"means": {c: {"all": of} for c, of in table.items()}},
         "robustness": {"nominal": numbers},
@@ -53,7 +53,7 @@ def test_render__begins_with_one_sentence_a_figure_and_a_table():
     numbers, rows, rest = first_screen(page)
     assert numbers == ["0.0606", "0.0303", "0.0404", "0.0202", "0.0101", "0.0105"]
     names = ["PID by hand", "PID optimised", "PPO as printed"]
-    names += ["PPO by groups, the paper&#39;s observation", "PPO, our interface", "strongest PID"]
+    names += ["PPO by groups, the paper&#39;s observation", "PPO, our agent", "strongest PID"]
     assert [row[0] for row in rows[:6]] == names  # no run of the critic on our nets
     assert rows[4][1:4] == ["closed", "0.0101 (0.0091 to 0.0111)", "0.0101"]
     figure, words, *verdict = rows[7]
@@ -64,7 +64,7 @@ def test_render__begins_with_one_sentence_a_figure_and_a_table():
     assert page.index("<img") < page.index("<table") and "trial" not in rest
     last = page.split("<h2>")[-1]
     heads = re.findall("<td>lead of (.*?) over (.*?)</td>", last)
-    assert heads == [("PPO, our interface", "strongest PID")]
+    assert heads == [("PPO, our agent", "strongest PID")]
     assert re.findall(r"<td>(-?\d\.\d\d)</td>", last) == ["0.04"]  # 1 - 0.0101 / 0.0105
 
 
@@ -72,7 +72,7 @@ def test_render__sets_a_trial_beside_the_shipped_results():
     numbers, rows, rest = first_screen(render(0.1, "brokk170"))
     table = json.loads((SHIPPED / "brokk170" / "table.json").read_text())["table"]
     assert numbers[1] == f"{table['rl_paper'][ERROR]['mean']:.4f}"
-    ours = next(row for row in rows if row[0] == "PPO, our interface")
+    ours = next(row for row in rows if row[0] == "PPO, our agent")
     assert ours[6] == "0.0101 (0.0091 to 0.0111)" and "is of a trial" in rest
     numbers, *_ = first_screen(render(0.1))  # of a machine without shipped results
     assert numbers[1] == "0.0303"
@@ -100,7 +100,7 @@ def test_plot_errors__has_a_row_with_an_interval_for_each_controller():
     one, other = ({"mean": mean, "low": mean - 1, "high": mean + 1} for mean in (2.0, 5.0))
     (ax,) = report.plot_errors({"rl": one, "pid_by_hand": other}).axes
     labels = [text.get_text() for text in ax.get_yticklabels()]
-    assert labels == ["PPO, our interface", "PID by hand"]
+    assert labels == ["PPO, our agent", "PID by hand"]
     ((mean, _, (bars,)),) = ax.containers
     assert np.array(mean.get_data()).tolist() == [[2, 5], [0, 1]]
     assert np.array(bars.get_segments())[..., 0].tolist() == [[1, 3], [4, 6]]
