@@ -139,7 +139,8 @@ def row(controller: Controller, name: str, net: Any, schedule: Schedule, task: A
 def main(options: Options) -> None:
     policies = {n: load_policy(POLICY.with_name(f), M) for n, f in POLICIES.items()}
     net = policies["rl"].net
-    each: dict[str, Controller] = {**policies, **baselines.read_gains(POLICY.with_name("gains.json"), M, net)}
+    pids = baselines.read_gains(POLICY.with_name("gains.json"), M, net)
+    each: dict[str, Controller] = {**policies, **pids}
     moves = sequences.axis_sequences(M)
     starts = sequences.draw_starts(M, options.starts, moves, SEED)
     task = moves, starts, adaptive.warm_up_motions(M)
