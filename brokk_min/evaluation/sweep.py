@@ -10,7 +10,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation.baselines import read_gains
 from brokk_min.evaluation.metrics import Mean, Table, evaluate, means, metadata
 from brokk_min.evaluation.reproduce import mean_errors, robustness
-from brokk_min.evaluation.sequences import axis_sequences, evaluation_starts, task_sequences
+from brokk_min.evaluation.sequences import AXES, axis_sequences, evaluation_starts, task_sequences
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
@@ -31,8 +31,9 @@ def sweep(
 ) -> dict[str, dict[str, Mean]]:
     """Train and evaluate `seeds`; means over seeds with intervals, by sequence and figure.
 
-    They and all runs go to `sweep.json` in `out`, policies and their curves to `seed_<n>.npz`. A
-    seed counts once, with its mean over `starts` poses. `scheduler` is the address of a dask
+    The sequence "along" is the mean of x, y and z. They go to `seeds.json` in `out`, with all runs
+    to `sweep.json`, policies and their curves to `seed_<n>.npz`. A seed counts once, with its mean
+    over `starts` poses. `scheduler` is the address of a dask
     scheduler, whose workers must have the folder (None: this machine). With a folder `beside` of
     `reproduce`, or of the package, `robustness.json` has the mean errors on changed machines, too.
     """
@@ -40,8 +41,12 @@ def sweep(
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
     done = side_by_side({str(seed): partial(job, seed) for seed in seeds}, None, scheduler)
     rows = [{"seed": int(seed)} | row for seed, of in done.items() for row in of]
-    table = means([row | {"start": row["seed"]} for row in rows])["rl"]
+    each = [row | {"start": row["seed"]} for row in rows]
+    along = means([row for row in each if row["sequence"] in AXES])["rl"]["all"]
+    table = {**means(each)["rl"], "along": along}
     meta = metadata(machine, min(seeds)) | {"actuator": fingerprint(net)}
+    meta |= {"seeds": [int(seed) for seed in seeds], "recipe": asdict(recipe)}
+    write_json(out / "seeds.json", {"meta": meta, "table": table})
     write_json(out / "sweep.json", {"meta": meta, "table": table, "runs": rows})
     if beside:
         policies = {f"seed {seed}": out / f"seed_{seed}.npz" for seed in seeds}
@@ -51,7 +56,7 @@ def sweep(
         every = policies | others | {"pids": gains}
         jobs = {name: partial(score, name, file) for name, file in every.items()}
         cases = side_by_side(jobs, None, scheduler)
-        meta |= {"starts": min(starts, 16), "seeds": [int(seed) for seed in seeds]}
+        meta |= {"starts": min(starts, 16)}
         meta["files"] = {file.name: digest(file) for file in every.values()}
         result = {"meta": meta, "robustness": pool(cases, [*policies])}
         write_json(out / "robustness.json", result)

@@ -184,7 +184,9 @@ def test_faults__of_the_valve_controller_by_hand(kind, counts, reasons):
     assert machine.reasons[:1] == reasons
 
 
-@pytest.mark.parametrize("text", ["stuck", "stuck@", "stuck@-1", "broken@1", "q9:stuck@1", "@1", ":off@1"])
+@pytest.mark.parametrize(
+    "text", ["stuck", "stuck@", "stuck@-1", "broken@1", "q9:stuck@1", "@1", ":off@1"]
+)
 def test_parse_fault__refuses_what_it_does_not_know(text):
     refusal = r"--fault: expected \[NAME:\]KIND@SECONDS, a name of .* 'valves'\], a kind of .* got "
     with pytest.raises(ValueError, match=f"^{refusal}{text}$"):

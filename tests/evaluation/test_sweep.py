@@ -77,7 +77,7 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
     assert run(command) == 0
     printed = capsys.readouterr().out
     names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("npz", "npz.csv")]
-    assert sorted(path.name for path in out.iterdir()) == [*names, "sweep.json"]
+    assert sorted(path.name for path in out.iterdir()) == [*names, "seeds.json", "sweep.json"]
     times = [(out / name).stat().st_mtime_ns for name in names]
     assert run(command) == 0
     assert capsys.readouterr().out == printed
@@ -88,10 +88,15 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
     written = json.loads((out / "sweep.json").read_text())
     assert [row["seed"] for row in written["runs"]] == [3] * 6 + [4] * 6
     assert written["runs"][6:] == [{"seed": 4} | row for row in alone]
-    assert list(written["table"]) == ["x", "y", "z", "all"]
+    assert list(written["table"]) == ["x", "y", "z", "all", "along"]
+    assert json.loads((out / "seeds.json").read_text()) == {
+        key: written[key] for key in ("meta", "table")
+    }
+    assert written["meta"]["seeds"] == [3, 4]
     seeds = np.reshape([row[ERROR] for row in written["runs"]], (2, 6)).mean(axis=1)
     mean = metrics.mean_interval(seeds)  # a seed counts once
     assert written["table"]["all"][ERROR] == pytest.approx(mean)
+    assert written["table"]["along"] == written["table"]["all"]  # of x, y and z alone
     assert f"{ERROR:24} {metrics.interval_text(mean)}\n" in printed
     other = replace(RECIPE, task=replace(RECIPE.task, episode_s=0.8))
     told = r"seed_4\.npz: recipe: task: episode_s: expected 0\.8, got 20\.0"

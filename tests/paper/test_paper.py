@@ -10,11 +10,15 @@ import runpy
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from brokk_min._files import SHIPPED
+from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST
 from brokk_min.evaluation.claims import verdict_rows
+from brokk_min.evaluation.metrics import interval_text
+from brokk_min.evaluation.rollout import title
 
 ROOT = Path(__file__).parents[2]
 MAKER = runpy.run_path(str(ROOT / "docs" / "paper.py"))
@@ -182,29 +186,68 @@ def test_tests__use_the_code_of_their_row(code: str, test: str) -> None:
     assert not missing, f"{test} do not use {missing}"
 
 
-VERDICTS = "<!-- verdicts: written by `python tests/paper/test_paper.py` -->\n"
+def shipped(name: str) -> Any:
+    """What is in a shipped JSON file of results."""
+    return json.loads((SHIPPED / "brokk170" / name).read_text())
 
 
-def with_verdicts(text: str) -> str:
-    """The page with the verdicts of the shipped table."""
-    shipped = json.loads((SHIPPED / "brokk170" / "table.json").read_text())
-    rows = [["where", "the paper writes", "of", "measured", "the sentence"], ["---"] * 5]
-    rows += verdict_rows(shipped["claims"])
-    lines = [f"| {' | '.join(row)} |\n" for row in rows]
-    before, _, after = text.partition(VERDICTS)
-    end = "<!-- end of verdicts -->"
-    return before + VERDICTS + "".join(lines) + end + after.partition(end)[2]
+def verdicts() -> list[list[str]]:
+    """Rows of the paper's sentences."""
+    heads = ["where", "the paper writes", "of", "measured", "the sentence"]
+    return [heads, *verdict_rows(shipped("table.json")["claims"])]
 
 
-def test_verdicts__are_those_of_the_shipped_table() -> None:
-    assert with_verdicts(PAPER) == PAPER, "run `python tests/paper/test_paper.py`"
+def machines() -> list[list[str]]:
+    """Errors on other machines, as each controller is, cold and warm."""
+    cases, names = (
+        shipped("robustness.json")["robustness"],
+        ("rl", STRONGEST, "rl_paper", OPTIMISED),
+    )
+    rows = [["machine", *map(title, names)]]
+    for case, of in cases.items():
+        each = (
+            [of[f"{name}{start}"]["mean"] for start in ("", "+cold", "+warm")] for name in names
+        )
+        rows.append([case, *(" → ".join(f"{error:.4f}" for error in errors) for errors in each)])
+    return rows
+
+
+def seeds() -> list[list[str]]:
+    """Figures over training seeds."""
+    rows = [["controller", "seeds", "velocity error [m/s]", "drift [m]"]]
+    for name in ("rl", "rl_critic_nets"):
+        content = shipped(f"seeds_{name}.json")
+        number = str(len(content["meta"]["seeds"]))
+        of = content["table"]["along"]
+        figures = (of[key] for key in ("velocity_error_mean", "off_axis_drift_max"))
+        rows.append([title(name), number, *map(interval_text, figures)])
+    return rows
+
+
+WRITTEN = {"verdicts": verdicts, "machines": machines, "seeds": seeds}
+
+
+def with_tables(text: str) -> str:
+    """The page with the tables of the shipped files of results."""
+    for name, rows in WRITTEN.items():
+        heads, *others = rows()
+        lines = [f"| {' | '.join(row)} |\n" for row in (heads, ["---"] * len(heads), *others)]
+        begin = f"<!-- {name}: written by `python tests/paper/test_paper.py` -->\n"
+        end = f"<!-- end of {name} -->"
+        before, _, after = text.partition(begin)
+        text = before + begin + "".join(lines) + end + after.partition(end)[2]
+    return text
+
+
+def test_tables__are_those_of_the_shipped_files() -> None:
+    assert with_tables(PAPER) == PAPER, "run `python tests/paper/test_paper.py`"
 
 
 def write() -> None:
     """Write links and verdicts of PAPER.md; ValueError: the first that is no longer there."""
     lines = [link(label) for label in LABELS]
     text = PAGE.read_text().removesuffix(LINKS) + "\n" + "\n".join(lines) + "\n"
-    PAGE.write_text(with_verdicts(text))
+    PAGE.write_text(with_tables(text))
 
 
 if __name__ == "__main__":
