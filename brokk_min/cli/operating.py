@@ -25,12 +25,14 @@ from brokk_min.cli.options import (
     load_pids,
     own_controller,
 )
-from brokk_min.evaluation.baselines import OPTIMISED, baselines
+from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST, baselines
 from brokk_min.evaluation.rollout import title
 from brokk_min.identification.valve_report import describe, load_known, save_known
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import PWM_MAX, Controller, Machine, require
 from brokk_min.shadow import Shadow
+
+PIDS = {"jacobian": OPTIMISED, "strongest": STRONGEST}  # by their names in --controller
 
 
 @dataclass(kw_only=True)
@@ -58,7 +60,7 @@ class DriveMachine(Command):
     command: str = ""  # joystick, the default, or a CSV: sequence,time,vx,vy,vz [s, m/s].
     shadow: bool = False  # Send nothing: show what would be sent beside what others send.
     sync: bool = False  # With --shadow, send SYNC and start the nodes all the same.
-    controller: str = "rl"  # Policy; or jacobian, optimised PID; jog, one joint; FILE.py:NAME.
+    controller: str = "rl"  # Policy; jacobian or strongest, PIDs; jog, one joint; FILE.py:NAME.
     joint: str = ""  # Joint that jogs, forward and backward with x.
     counts: int = 12  # Its command, of 127; a little beyond the dead zone.
     axes: tuple[int, int, int] = (1, 0, 4)  # Axes of the joystick for x, y and z.
@@ -95,8 +97,8 @@ class DriveMachine(Command):
     def find_controller(self, machine: Machine) -> Controller:
         """The controller that is named."""
         if self.controller != "jog":
-            found, net = find_controller(machine, self.policy, self.controller != "jacobian")
-            if self.controller not in ("rl", "jacobian"):
+            found, net = find_controller(machine, self.policy, PIDS.get(self.controller))
+            if self.controller not in ("rl", *PIDS):
                 found = own_controller(self.controller, machine, net)
             if not (self.adapt or self.shadow):
                 return found
@@ -127,16 +129,16 @@ class DriveMachine(Command):
 
 
 def find_controller(
-    machine: Machine, policy: Path | None, rl: bool
+    machine: Machine, policy: Path | None, pid: str | None
 ) -> tuple[Controller, ActuatorNet]:
-    """The policy, or the PID with the gains that there are (or by hand without); and their nets."""
+    """The policy, or a PID with the gains that there are (or by hand without); and their nets."""
     path, gains = default_policy(machine, policy)
     found = load_policy(path, machine)
-    if rl:
+    if not pid:
         return found, found.net
     print(f"gains of the PID: {gains or 'set by hand'}")
     pids = load_pids(machine, gains, found.net) if gains else baselines(machine, found.net)
-    return pids[OPTIMISED], found.net
+    return pids[pid], found.net
 
 
 def show(drive: hw.Drive) -> None:
@@ -188,7 +190,7 @@ class Play(Command):
 
         controllers: dict[str, Controller] = {}
         for name in ("rl", OPTIMISED):
-            found, net = find_controller(machine, self.policy, name == "rl")
+            found, net = find_controller(machine, self.policy, None if name == "rl" else name)
             adaptive = Adaptive(found, net, machine) if self.adapt else found
             controllers[title(f"{name}+cold" if self.adapt else name)] = adaptive
         play(machine, controllers, find_plant(self.plant, machine))

@@ -10,20 +10,24 @@ import pytest
 from helpers_bus import BASELINE, HoldingOperator, Virtual, World, only
 
 from brokk_min.beyond.adaptation import valves
+from brokk_min.beyond.strong_pid import StrongPID
 from brokk_min.can.connection import open_bus
 from brokk_min.can.drive_log import read_frames
 from brokk_min.can.operator_input import Joystick
 from brokk_min.cli.operating import DriveMachine, Simulate, find_controller, show, status
+from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST
 from brokk_min.identification.valve_report import KEPT
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import BROKK_170
 
 
 def test_find_controller__is_the_policy_or_the_pid_with_the_gains_beside_it(folder):
-    pid, net = find_controller(BROKK_170, folder / "policy.npz", rl=False)
+    pid, net = find_controller(BROKK_170, folder / "policy.npz", pid=OPTIMISED)
     assert (pid.gains.ki == 8.0).all() and pid.k == 0.1
+    strongest, _ = find_controller(BROKK_170, folder / "policy.npz", pid=STRONGEST)
+    assert isinstance(strongest, StrongPID)
     (folder / "gains.json").write_text("of other nets")  # which the policy does not need
-    policy, nets = find_controller(BROKK_170, folder / "policy.npz", rl=True)
+    policy, nets = find_controller(BROKK_170, folder / "policy.npz", pid=None)
     assert isinstance(policy, Policy) and nets.joints == net.joints == policy.net.joints
 
 
