@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]  # of any shape, float32 or float64
-LONGEST = 100  # m: no link is so long, but in millimetres most are
 PWM_MAX = 127  # counts of full command; paper: [0,127] is positive, [255,128] negative
 
 
@@ -151,8 +150,7 @@ class Machine:
     def __post_init__(self) -> None:
         """ValueError: what cannot be a machine, with the field, what is wanted and what it got."""
         python_numbers(self)
-        drives = any(getattr(joint, "driven", False) for joint in self.joints)
-        require(drives, "joints", "a Joint that is driven, or more", self.joints)
+        require(len(self.joints) > 0, "joints", "one Joint or more", self.joints)
         slower = min(self.rate, self.tool_speed)
         require(slower > 0, "rate, tool_speed", "positive numbers", slower)
         bits = self.encoder_bits
@@ -162,8 +160,6 @@ class Machine:
             require(pair, f"{j.name}.dead_zone", "a pair, up and down", j.dead_zone)
             slower = min(j.q_dot_up, j.q_dot_down)
             require(slower > 0, f"{j.name}.q_dot_up, q_dot_down", "positive numbers", slower)
-            longest = max(abs(j.a), abs(j.d))
-            require(longest < LONGEST, f"{j.name}.a, d", f"metres, below {LONGEST}", longest)
             known = j.kind in ("revolute", "prismatic")
             require(known, f"{j.name}.kind", "revolute or prismatic", j.kind)
             signed = j.encoder_sign in (-1, 1)

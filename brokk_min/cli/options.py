@@ -19,6 +19,7 @@ from brokk_min.evaluation.baselines import Baselines, read_gains
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX, Controller, Machine, require
 
+LONGEST = 100  # m: no link is so long, but in millimetres most are
 FRACTIONS = ("gamma", "gae_lambda", "zero_goals", "axis_goals", "noise", "weight_decay")
 
 
@@ -66,6 +67,8 @@ class Command:
             return BROKK_170
         machine = load_object("--machine", self.machine)
         check(isinstance(machine, Machine), "--machine", "a Machine", brief(machine))
+        longest = max(max(abs(j.a), abs(j.d)) for j in machine.joints)
+        check(longest < LONGEST, "--machine", f"links in metres, below {LONGEST}", longest)
         return machine  # type: ignore[no-any-return]
 
     def writes(self, *paths: Path | None, reads: Sequence[Path | None] = ()) -> None:

@@ -16,6 +16,7 @@ from beside_it import NAME
 from brokk_min.machine import BROKK_170
 from brokk_min.actuator import AnalyticPlant
 DIGGER = replace(BROKK_170, name=NAME)
+LONG = replace(DIGGER, joints=tuple(replace(j, a=1000 * j.a) for j in DIGGER.joints))
 NUMBER = 3
 
 class Own(AnalyticPlant):
@@ -49,6 +50,8 @@ def test_find_machine__takes_a_name_or_an_object_of_a_file(file):
     assert Command(machine=f"{file}:DIGGER").find_machine().name == "digger"
     with pytest.raises(WrongUse, match="--machine: expected a Machine, got 3"):
         Command(machine=f"{file}:NUMBER").find_machine()
+    with pytest.raises(WrongUse, match=r"--machine: expected links in metres, below 100, got 1250"):
+        Command(machine=f"{file}:LONG").find_machine()
     with pytest.raises(WrongUse, match=r"--machine: expected an object NONE in .*, got none"):
         Command(machine=f"{file}:NONE").find_machine()
     file.write_text("1 / 0")
