@@ -99,7 +99,8 @@ def plot_over_time(dt: float, rows: Sequence[Row], share: bool = True) -> Figure
         for i, label in enumerate(labels):
             columns = {name: (dt * np.arange(1, len(y) + 1), y[:, i]) for name, y in curves.items()}
             draw_curves(row[i], columns, "time [s]", label)
-    axes[0, 0].legend(fontsize="small")
+    lines = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*lines, loc="outside upper center", ncols=3, fontsize="small")
     return figure
 
 

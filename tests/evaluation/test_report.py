@@ -126,7 +126,7 @@ def test_plot_sequence__is_relative_to_where_the_tool_began():
     figure = report.plot_sequence(BROKK_170, traces, sequence, POSE[None])
     goals = sequence.for_starts(BROKK_170, POSE[None])[:, 0]
     time = 0.05 * np.arange(1, 521)
-    (goal, policy, *_) = (text.get_text() for text in figure.axes[0].get_legend().get_texts())
+    (goal, policy, *_) = (text.get_text() for text in figure.legends[0].get_texts())
     p_start = tool_position(forward_kinematics(BROKK_170, POSE))
     for i in range(3):
         above, below = curves(figure.axes[i]), curves(figure.axes[3 + i])

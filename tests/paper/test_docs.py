@@ -65,19 +65,18 @@ def test_shipped_tables__name_the_files_beside_them(table: Path) -> None:
         assert name.startswith("seed_") or beside.get(name) == fingerprint, name
 
 
-CHANGED = re.compile(r"^\| (.+?) \| (\d\.\d{4}[^|]*(?: \| \d\.\d{4}[^|]*)*) \|$", re.M)
+CHANGED = re.compile(r"^\| (.+?) \| (\d\.\d{4} →[^|]*) \| (\d\.\d{4} →[^|]*) \|$", re.M)
 
 
 def test_readme__errors_on_changed_machines_are_those_of_the_sweep() -> None:
-    """Columns: our agent, the strongest PID, with the paper's observation, the optimised PID."""
-    file = SHIPPED / "brokk170" / "robustness.json"
-    cases = json.loads(file.read_text())["robustness"] if file.exists() else {}
-    columns = ("rl", "jacobian_pid_ff_integral", "rl_paper", "jacobian_pid_k0.1")
+    """Columns: our agent, the strongest PID; each plain, cold and warm."""
+    cases = json.loads((SHIPPED / "brokk170" / "robustness.json").read_text())["robustness"]
     rows = [row for row in CHANGED.findall(README.read_text()) if row[0] in cases]
-    assert bool(rows) == file.exists()
-    for name, cells in rows:
-        means = [f"{cases[name][controller]['mean']:.4f}" for controller in columns]
-        assert cells.split(" | ") == means, name
+    assert len(rows) == 3
+    for name, *cells in rows:
+        for controller, cell in zip(("rl", "jacobian_pid_ff_integral"), cells, strict=True):
+            of = [cases[name][f"{controller}{start}"] for start in ("", "+cold", "+warm")]
+            assert cell == " → ".join(f"{number['mean']:.4f}" for number in of), name
 
 
 def test_readme__lists_the_wings() -> None:

@@ -15,7 +15,10 @@ from typing import Any
 import pytest
 
 from brokk_min._files import SHIPPED
+from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST
 from brokk_min.evaluation.claims import verdict_rows
+from brokk_min.evaluation.metrics import interval_text
+from brokk_min.evaluation.rollout import title
 
 ROOT = Path(__file__).parents[2]
 MAKER = runpy.run_path(str(ROOT / "docs" / "paper.py"))
@@ -194,7 +197,34 @@ def verdicts() -> list[list[str]]:
     return [heads, *verdict_rows(shipped("table.json")["claims"])]
 
 
-WRITTEN = {"verdicts": verdicts}
+def machines() -> list[list[str]]:
+    """Errors on other machines, as each controller is, cold and warm."""
+    cases, names = (
+        shipped("robustness.json")["robustness"],
+        ("rl", STRONGEST, "rl_paper", OPTIMISED),
+    )
+    rows = [["machine", *map(title, names)]]
+    for case, of in cases.items():
+        each = (
+            [of[f"{name}{start}"]["mean"] for start in ("", "+cold", "+warm")] for name in names
+        )
+        rows.append([case, *(" → ".join(f"{error:.4f}" for error in errors) for errors in each)])
+    return rows
+
+
+def seeds() -> list[list[str]]:
+    """Figures over training seeds."""
+    rows = [["controller", "seeds", "velocity error [m/s]", "drift [m]"]]
+    for name in ("rl", "rl_critic_nets"):
+        content = shipped(f"seeds_{name}.json")
+        number = str(len(content["meta"]["seeds"]))
+        of = content["table"]["along"]
+        figures = (of[key] for key in ("velocity_error_mean", "off_axis_drift_max"))
+        rows.append([title(name), number, *map(interval_text, figures)])
+    return rows
+
+
+WRITTEN = {"verdicts": verdicts, "seeds": seeds, "machines": machines}
 
 
 def with_tables(text: str) -> str:
