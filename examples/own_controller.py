@@ -1,7 +1,7 @@
 """A controller of one's own: damped least squares, and valves opened in proportion to the speed.
 
-    brokk-min evaluate --controller examples/own_controller.py:PROPORTIONAL
-    brokk-min drive --controller examples/own_controller.py:PROPORTIONAL --interface ...
+    brokk-min evaluate --controller examples/own_controller.py:Proportional
+    brokk-min drive --controller examples/own_controller.py:Proportional --interface ...
 
 It knows each joint's nominal speeds and dead zones, and nothing of its error.
 """
@@ -34,6 +34,3 @@ class Proportional:
         u = np.zeros_like(measured.q)
         u[..., driven] = valve_command(q_dot / by_direction(q_dot, fastest), m.dead_zones[driven])
         return limit_command(m, u), state
-
-
-PROPORTIONAL = Proportional

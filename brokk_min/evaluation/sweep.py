@@ -33,9 +33,9 @@ def sweep(
 
     The sequence "along" is the mean of x, y and z. They go to `seeds.json` in `out`, with all runs
     to `sweep.json`, policies and their curves to `seed_<n>.npz`. A seed counts once, with its mean
-    over `starts` poses. `scheduler` is the address of a dask
-    scheduler, whose workers must have the folder (None: this machine). With a folder `beside` of
-    `reproduce`, or of the package, `robustness.json` has the mean errors on changed machines, too.
+    over `starts` poses. `scheduler` is the address of a dask scheduler, whose workers must have the
+    folder (None: this machine). With a folder `beside` of `reproduce`, or of the package,
+    `robustness.json` has the mean errors on changed machines, too.
     """
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)

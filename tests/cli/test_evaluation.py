@@ -44,7 +44,7 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
 def test_evaluate__takes_a_controller_of_ones_own(folder, capsys):
     example = Path(__file__).parents[2] / "examples" / "own_controller.py"
     (folder / "own.py").write_text(example.read_text())
-    name = f"{folder}/own.py:PROPORTIONAL"
+    name = f"{folder}/own.py:Proportional"
     assert evaluate(folder, f"--controller {name} --json {folder}/own.json") == 0
     runs = json.loads((folder / "own.json").read_text())["runs"]
     own = next(run for run in runs if run["controller"] == name)
