@@ -27,7 +27,8 @@ PRE_OPERATIONAL_ALL = bytes([128, 0])  # in this state every encoder takes setti
 POSITION_BITS = 26  # of the encoders that we simulate
 NO_POSITION = 0xFFFFFFFF  # what many encoders send when they fail
 HEARTBEAT_PERIOD = 0.050  # s, set in the encoders (assumed)
-SDO_TIMEOUT = 0.5  # s (assumed)
+SDO_TIMEOUT = 0.5  # s (assumed), then the request is sent once more,
+SDO_TRIES = 10  # so often in all, since a node that was just switched on boots for seconds
 MAX_FRAMES = 256  # read in a tick; with more the bus is flooded
 WATCHDOG = 0.150  # s without valid valve frame, then the controller closes the valves (assumed)
 MOST_JOINTS = 5  # in a valve frame
@@ -153,16 +154,17 @@ def sdo(bus: Any, node: int, address: tuple[int, int], data: bytes = b"") -> int
     """Read an object by index and subindex, or write up to four bytes; ValueError: no answer."""
     command = 0x23 | (4 - len(data)) << 2 if data else 0x40
     request = struct.pack("<BHB4s", command, *address, data)
-    bus.send(SDO_REQUEST + node, request)
     what = "node {}: object 0x{:04X}:{:02X}".format(node, *address)
-    end = bus.now() + SDO_TIMEOUT
-    while (left := end - bus.now()) > 0 and (frame := bus.recv(left)):
-        own = frame.id == SDO_ANSWER + node and frame.data[1:4] == request[1:4]
-        if own and len(frame.data) == 8:
-            command, answer = struct.unpack("<B3xI", frame.data)
-            require(command != 0x80, what, "an answer", f"SDO abort 0x{answer:08X}")
-            return int(answer)
-    raise ValueError(f"{what}: expected an answer within {SDO_TIMEOUT} s, got none")
+    for _ in range(SDO_TRIES):
+        bus.send(SDO_REQUEST + node, request)
+        end = bus.now() + SDO_TIMEOUT
+        while (left := end - bus.now()) > 0 and (frame := bus.recv(left)):
+            own = frame.id == SDO_ANSWER + node and frame.data[1:4] == request[1:4]
+            if own and len(frame.data) == 8:
+                command, answer = struct.unpack("<B3xI", frame.data)
+                require(command != 0x80, what, "an answer", f"SDO abort 0x{answer:08X}")
+                return int(answer)
+    raise ValueError(f"{what}: expected an answer within {SDO_TRIES * SDO_TIMEOUT} s, got none")
 
 
 def encoder_counts(machine: Machine, raw: ArrayLike) -> Counts:

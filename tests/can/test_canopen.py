@@ -85,6 +85,15 @@ def test_set_up_nodes__sets_up_the_encoders_and_starts_the_nodes():
     assert out.index(told[0]) < first_setting < out.index(told[1])
 
 
+def test_set_up_nodes__waits_for_a_node_that_boots():
+    world, out = World(BASELINE, HoldingOperator()), []
+    world.upward = lambda *frame: [frame] * (world.time > 1.2)  # s; silent before
+    world.downward = recording(out)
+    world.drive.begin()
+    objects = [data.hex()[2:8] for can_id, data in out if can_id == 0x601]
+    assert objects[:5] == ["016500"] * 4 + ["001801"]
+
+
 def changed(index, sub, value):
     """Node 4 answers with another value of one object."""
     address = struct.pack("<HB", index, sub)
@@ -104,7 +113,7 @@ ABORT = only(0x584, lambda data: [b"\x80" + data[1:4] + struct.pack("<I", 0x0602
         (changed(0x1A00, 1, 0x6030_01_10), "q4: .* 4 bytes of object 0x6004 .* .0x60300110"),
         (changed(0x6501, 0, 8192), "q4: object 0x6501:00: expected 4096 counts a turn, got 8192"),
         (ABORT, "node 4: object 0x6501:00: .*abort 0x06020000"),
-        (lambda *frame: [], "node 1: object 0x6501:00: .* answer within 0.5 s, got none"),
+        (lambda *frame: [], "node 1: object 0x6501:00: .* answer within 5.0 s, got none"),
     ],
 )
 def test_set_up_nodes__refuses_an_encoder_that_does_not_fit(upward, refusal):
