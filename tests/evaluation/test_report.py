@@ -59,7 +59,7 @@ def test_render__begins_with_one_sentence_a_figure_and_a_table():
     figure, words, *verdict = rows[7]
     assert (figure, words) == ("Fig. 6b-d", "the y and z positions remain stationary")
     measured = "drift 0.1280 (0.1000 to 0.1500)"
-    assert verdict == ["PPO as printed", measured, "<b>does not hold here</b>"]
+    assert verdict == ["<b>does not hold here</b>", "PPO as printed", measured]
     assert "<td>+5.0 (+4.0 to +6.0), 2 of 32</td>" in page
     assert page.index("<img") < page.index("<table") and "trial" not in rest
     last = page.split("<h2>")[-1]
