@@ -30,7 +30,7 @@ Rng = np.random.Generator
 Rows = NDArray[np.intp]
 Weights = tuple[Array, ...]  # of nets, see `ActuatorNet`
 MAX_SEGMENT = 30.0  # s, assumed: longest motion that is recorded in one piece
-SEGMENT = 300  # samples, about, of one piece
+SEGMENT = 300  # samples, about, of each of the pieces that are recorded at once
 COMMANDED = 0.02  # of full command, assumed: more than a stick at rest gives
 MOVED = 0.01  # rad or m, assumed: more than a parked joint creeps
 

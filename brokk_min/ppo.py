@@ -1,11 +1,11 @@
 """Proximal Policy Optimization (Schulman et al., 2017) in one file, to be read from top to bottom.
 
 It trains on a Gymnasium vector environment with Box spaces that resets in the same step;
-`learning.gym_env` makes one of `env.reset` and `env.step`. A
-truncated episode did not fail: its return goes on with the value of its own last observation. At a
-termination it stops. Advantages come from a critic, as in the paper; `train` also accepts another
-advantage function. `python -m brokk_min.ppo` trains an agent on a task of Gymnasium.
-Names follow CleanRL's where they can; target_kl steers the learning rate. Paper: Sec. 3.4
+`learning.gym_env` makes one of `env.reset` and `env.step`. A truncated episode did not fail: its
+return goes on with the value of its own last observation. At a termination it stops. Advantages
+come from a critic, as in the paper; `train` also accepts another advantage function. `python -m
+brokk_min.ppo` trains an agent on a task of Gymnasium. Names follow CleanRL's where they can;
+target_kl steers the learning rate. Paper: Sec. 3.4
 """
 
 from __future__ import annotations

@@ -17,10 +17,9 @@ class TaskConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Settings of PPO, tuned; the paper prints the number of environments only.
+    """Settings of PPO, tuned; the paper prints the number of environments only."""
 
-    Defaults are of the paper's learner; `learning.recipes` has those of others.
-    """
+    # Those of the paper's learner; `learning.recipes` has those of others.
 
     total_steps: int = 30_000_000  # environment steps in all
     num_envs: int = 256  # environments side by side (paper: 256)

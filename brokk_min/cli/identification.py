@@ -106,7 +106,7 @@ class Fit(ReadsLogs):
     """Fit nets of each joint to logs of any machine; score them on other recordings."""
 
     out: Path  # Nets to write, .npz.
-    test: tuple[Path, ...] = ()  # Logs to score on; by default every tenth recording of LOGS.
+    test: tuple[Path, ...] = ()  # Logs to score on; by default every tenth recording.
     json: Path | None = None  # Also write the scores here.
     paper: bool = False  # The paper's recipe: errors of one step, commands as they are.
     seed: int = 0  # Of the weights and the drawn windows.

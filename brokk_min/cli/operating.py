@@ -56,7 +56,7 @@ class DriveMachine(Command):
 
     interface: str  # python-can's name of the bus: socketcan, udp_multicast, ...
     channel: str  # Channel of the interface: can0, 239.74.163.2, ...
-    policy: Path | None = None  # Policy that `train` wrote, with gains.json beside it.
+    policy: Path | None = None  # Policy that `train` wrote; PIDs: gains.json beside it, or ours.
     command: str = ""  # joystick, the default, or a CSV: sequence,time,vx,vy,vz [s, m/s].
     shadow: bool = False  # Send nothing: show what would be sent beside what others send.
     sync: bool = False  # With --shadow, send SYNC and start the nodes all the same.
@@ -181,7 +181,7 @@ class Play(Command):
     the valve commands. On a busy computer the machine moves slower than life.
     """
 
-    policy: Path | None = None  # Policy that `train` wrote, with gains.json beside it.
+    policy: Path | None = None  # Policy that `train` wrote; PIDs: gains.json beside it, or ours.
     plant: str = "analytic"  # What moves, or FILE.py:NAME.
     adapt: bool = False  # The controllers learn how the valves differ from those of the logs.
 

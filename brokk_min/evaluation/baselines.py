@@ -200,7 +200,7 @@ def tuned_baselines(
 
 
 def beside_pids(machine: Machine, pids: Baselines) -> Callable[[Controller], str]:
-    """A function that says a policy's mean |v_goal - v_tool| [m/s] beside those of two PIDs.
+    """A function that says a policy's mean |v_goal - v_tool| [m/s] beside those of three PIDs.
 
     All drive the analytic plant along the same motions, which are neither tuned on nor scored.
     """
@@ -211,9 +211,9 @@ def beside_pids(machine: Machine, pids: Baselines) -> Callable[[Controller], str
         trace = rollout(machine, controller, start, goals, TaskConfig.noise, rng)
         return f"{np.linalg.norm(goals - trace.v_tool, axis=-1).mean():.4f}"
 
-    pid = f"the PID tuned by hand has {error(pids[BY_HAND])}, the optimised one"
-    pid = f"{pid} {error(pids[OPTIMISED])}"
-    return lambda policy: f"{error(policy)} m/s; {pid}"
+    by_hand, optimised, strongest = (error(pids[name]) for name in (BY_HAND, OPTIMISED, STRONGEST))
+    pid = f"the PID tuned by hand has {by_hand}, the optimised one {optimised}"
+    return lambda policy: f"{error(policy)} m/s; {pid}, the strongest {strongest}"
 
 
 def gains_metadata(machine: Machine, net: ActuatorNet) -> dict[str, Any]:

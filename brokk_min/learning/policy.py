@@ -41,6 +41,8 @@ class Policy:
         """
         x: Array = np.asarray(observation, np.float32)
         *hidden, w_out, b_out = self.weights
+        wanted = f"{len(hidden[0])} numbers of the interface {self.interface!r}"
+        require(x.shape[-1:] == hidden[0].shape[:1], "observation", wanted, x.shape)
         for w, b in zip(hidden[::2], hidden[1::2], strict=True):
             x = x @ w + b
             x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))  # ELU

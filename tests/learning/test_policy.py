@@ -34,6 +34,11 @@ def test_act__equals_the_actor_of_torch():
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
+def test_act__refuses_observations_of_another_interface():
+    with pytest.raises(ValueError, match=r"^observation: .* 91 numbers .*'beyond', got \(64, 163\)"):
+        random_policy("beyond").act(np.zeros((64, 163)))
+
+
 @pytest.mark.parametrize("kind", ["paper", "beyond"])
 def test_controller__remembers_how_long_its_goal_is_zero(kind):
     """Valves of our agent close after 0.1 s of a zero goal; the paper's go on."""
