@@ -28,7 +28,7 @@ class OurFitConfig(FitConfig):
 
     weight_decay: float = 0.0  # 0.3 for logs of a few minutes
     rollout: int = 8  # ticks of the errors in the last third of the steps (paper: 1)
-    valve: bool = True  # nets read what commands open; with --no-valve the commands as they are (paper)
+    valve: bool = True  # nets read what commands open; --no-valve: the commands (paper)
     members: int = 5  # such nets a joint, 1 of others; their mean counts (beyond.net_ensemble)
     newest_only: bool = False  # do they read commands and the newest angle and velocity alone?
 

@@ -35,7 +35,7 @@ def test_act__equals_the_actor_of_torch():
 
 
 def test_act__refuses_observations_of_another_interface():
-    with pytest.raises(ValueError, match=r"^observation: .* 91 numbers .*'beyond', got \(64, 163\)"):
+    with pytest.raises(ValueError, match=r"^observation: .* 91 numbers .*, got \(64, 163\)"):
         random_policy("beyond").act(np.zeros((64, 163)))
 
 
