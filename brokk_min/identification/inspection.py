@@ -37,7 +37,10 @@ COARSE = 0.5  # s
 CLEAR = 0.2  # of the fastest expected motion: more is clear
 OPENS = 0.3  # of full command: it opens any valve
 RESTS = 0.1  # of the expected motion: less is rest
-STILL = 1.5  # s of clear commands without motion; in sound logs of ours up to 1.15
+STILL = 1.5  # s of clear commands without motion; in sound logs of ours up to 1.15, and
+USUALLY, SOUND = 4.0, 0.6  # so many times the quantile of the log's, of sound ones up to 3.1
+AT_LEAST = (0.9, 0.3)  # s, if less or more of the motion is explained than
+WELL = 0.9  # as without noise, without coarse steps, and where valves open at once
 RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
@@ -104,14 +107,21 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     span = (q.min(), q.max())
     each = [motion_of([one], j, rate, span) for one in recordings]
     still = np.array([np.ptp(one.q[:, j]) <= MOVED for one in recordings])
+    held = [np.convolve(one.u[:, j], np.ones(round(rate)) / rate, "valid") for one in recordings]
+    stuck = still & [min(x.max(), -x.min()) > OPENS for x in held]  # a stop it would leave one way
     for _ in range(4):  # again without those in which it stands still, until they are found
         before = still
         kept = [*compress(recordings, ~still | still.all())]
         motion = motion_of(kept, j, rate, span)
         model = fit_model(motion)
-        still = np.array([stands_still(one, model, motion) for one in each])
+        seconds = np.array([still_seconds(one, model, motion) for one in each])
+        least = AT_LEAST[model.explained > WELL]
+        usual = np.quantile(seconds, SOUND, method="lower")
+        still = stuck | (seconds > np.clip(USUALLY * usual, least, STILL))
         if still.all() or (still == before).all():
             break
+    if model.explained < LEAST_EXPLAINED and not still.all():
+        still = stuck  # the model cannot tell where it should move
     turned = opposite(recordings, j, rate)
     q_dot = np.concatenate([one.q_dot[:, j] for one in kept])
     steps = np.abs(np.diff(q))
@@ -122,14 +132,14 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     }
     other = max(by, key=lambda name: by[name], default="")
     driven = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
-    held = means(motion, motion.u, 1.0)
+    second = means(motion, motion.u, 1.0)
     coarse = (means(motion, x, COARSE) for x in (motion.velocity, expected_velocity(motion, model)))
     return JointReport(
         minutes=driven / rate / 60,
         low=span[0],
         high=span[1],
         fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
-        largest=(held.max(), -held.min()),
+        largest=(second.max(), -second.min()),
         sign=sign(np.concatenate([one.u[:, j] for one in kept]), q_dot, rate),
         explained=model.explained,
         coarse=explained_part(*coarse),
@@ -165,11 +175,14 @@ def sign(u: Array, q_dot: Array, rate: float, least: float = CLEAR_SIGN) -> int:
 
 def opposite(recordings: Sequence[Recording], j: int, rate: float) -> list[str]:
     """Names of the recordings in which joint `j` moves the other way than in most of them."""
-    driven = [one for one in recordings if np.ptp(one.u[:, j]) > COMMANDED]
-    signs = [sign(one.u[:, j], one.q_dot[:, j], rate, OPPOSITE) for one in driven]
+    names, signs = [], []
+    for one in recordings:
+        u, q, q_dot = one.u[:, j], one.q[:, j], one.q_dot[:, j]
+        if np.ptp(u) > COMMANDED and np.ptp(q) > MOVED:
+            names.append(one.name)  # less the means, because a joint may sag all the time
+            signs.append(sign(u - u.mean(), q_dot - q_dot.mean(), rate, OPPOSITE))
     fewer = -np.sign(sum(signs)) or 1
-    names = [one.name for one, way in zip(driven, signs) if way == fewer]
-    return names if -fewer in signs else []
+    return [name for name, way in zip(names, signs) if way == fewer] if -fewer in signs else []
 
 
 def followed_joints(log: Log, samples: Samples, j: int) -> dict[str, float]:
@@ -291,19 +304,22 @@ def reach(motion: Motion) -> Array:
     return np.where(means(motion, motion.counts, 1.0) > 1 - 1e-9, widest, np.nan)
 
 
-def stands_still(motion: Motion, model: Model, others: Motion) -> bool:
-    """Does a joint rest while the model of `others` expects clear motion for `STILL` seconds?
+def still_seconds(motion: Motion, model: Model, others: Motion) -> float:
+    """How long a joint rests in one piece while the model of `others` expects clear motion [s].
 
-    Not in one piece, because a valve that was closed needs half of it to open.
+    A valve that was closed needs up to a second to open. Infinite: it does not answer at all.
     """
     if not others.velocity.any():
-        return bool(np.abs(motion.u).max() > OPENS)
-    expected = np.abs(expected_velocity(motion, model))
+        return np.inf if np.abs(motion.u).max() > OPENS else 0.0
+    signed = expected_velocity(motion, model)
+    expected = np.abs(signed)
     clear = max(CLEAR * np.abs(expected_velocity(others, model)).max(), MOVED)  # rad/s
+    if expected.max() > clear and np.std(motion.velocity) < RESTS * np.std(signed):
+        return np.inf  # it may sag, but does not answer
     ends = reach(motion) < RESTS * clear  # of a second at rest
     rests = np.convolve(ends, np.ones(round(motion.rate)))[-len(ends) :] > 0
     seconds = np.bincount(np.cumsum(~rests), rests & (expected > clear)) / motion.rate
-    return bool(seconds.max() > STILL)
+    return float(seconds.max())
 
 
 def rest_of(motion: Motion) -> float:
@@ -325,8 +341,9 @@ def one_size(u: Array) -> bool:
 def contradicts(motion: Motion, model: Model) -> bool:
     """Does a joint move against what the model expects of its commands?"""
     expected = expected_velocity(motion, model)
-    size = np.linalg.norm(expected) * np.linalg.norm(motion.velocity)
-    return bool(expected @ motion.velocity < -AGAINST * size)
+    velocity = motion.velocity - motion.velocity.mean()
+    size = np.linalg.norm(expected) * np.linalg.norm(velocity)
+    return bool(expected @ velocity < -AGAINST * size)
 
 
 def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
