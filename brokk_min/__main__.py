@@ -38,6 +38,7 @@ LINES = "\n".join(f"  {name:10} {of.__doc__.splitlines()[0]}" for name, of in CO
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; errors are one line on stderr."""
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, it was closed
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # an encoding that lacks a sign of ours
     if shutil.get_terminal_size().columns < NARROWEST:  # help of tyro would never end

@@ -146,6 +146,10 @@ def expect_same(place: Path | str, found: Mapping[str, Any], wanted: Mapping[str
         got = found.get(name)
         if isinstance(value, dict) and isinstance(got, dict):
             expect_same(f"{place}: {name}", got, value)
+        if isinstance(value, list) and isinstance(got, list) and len(got) == len(value):
+            expect_same(
+                f"{place}: {name}", *({str(i): x for i, x in enumerate(of)} for of in (got, value))
+            )
         require(got == value, f"{place}: {name}", brief(value), brief(got))
 
 
@@ -206,7 +210,7 @@ def load_arrays(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, NDArra
         require(size <= LARGEST, str(path), f"at most {LARGEST:,} bytes", f"{size:,}")
         header = json.loads(str(archive["header"])) if "header" in archive else {}
         wanted = f"{kind} (if it is older: train or fit again)"
-        got = header.pop("kind", None)
+        got = header.pop("kind", None) if isinstance(header, dict) else header
         require(got == kind, str(path), wanted, brief(got))
         arrays = {name: archive[name] for name in archive if name != "header"}
         for name, array in arrays.items():

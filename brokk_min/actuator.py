@@ -18,6 +18,7 @@ from brokk_min.machine import (
     Array,
     Machine,
     by_direction,
+    is_row,
     python_numbers,
     require,
     valve_opening,
@@ -117,12 +118,13 @@ def hydraulics_of(machine: Machine) -> Hydraulics:
     for joint in machine.joints:
         cylinder = h.cylinders.get(joint.name, Cylinder())
         require(cylinder.rod > 0, f"{joint.name}.rod", "a positive number", cylinder.rod)
-        pair = cylinder.speed is None or np.shape(cylinder.speed) == (2,)
+        pair = cylinder.speed is None or is_row(cylinder.speed, 2)
         require(pair, f"{joint.name}.speed", "a pair, up and down", cylinder.speed)
         low, high = cylinder.angle + joint.q_min, cylinder.angle + joint.q_max
         closes = cylinder.base == 0 or 0 < low < high < np.pi
         require(closes, f"{joint.name}.angle", "angles in (0, pi)", f"{low:.3f} to {high:.3f}")
-    require(min(h.delay, *h.gain) >= 0, "hydraulics", "delay and gain of 0 or more", h)
+    fits = is_row(h.gain, 2) and min(h.delay, *h.gain) >= 0
+    require(fits, "hydraulics", "a delay and a pair of gains of 0 or more", h)
     fastest = min(h.tau_spool, h.tau_cylinder, h.tau_valve_up, h.tau_valve_down)
     steps = machine.dt / h.dt
     fits = abs(steps - round(steps)) < 1e-6 and 0 < h.dt <= fastest  # explicit Euler

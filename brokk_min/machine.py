@@ -47,6 +47,12 @@ def python_numbers(value: Any, place: str = "") -> None:
         object.__setattr__(value, field.name, tuple(plain) if isinstance(plain, list) else plain)
 
 
+def is_row(value: Any, length: int) -> bool:
+    """Are these so many finite numbers?"""
+    row = np.asarray(value)
+    return row.shape == (length,) and row.dtype.kind in "iuf" and bool(np.isfinite(row).all())
+
+
 @dataclass(frozen=True)
 class Joint:
     """One joint: a row of standard Denavit-Hartenberg parameters, its range, its drive.
@@ -150,13 +156,15 @@ class Machine:
     def __post_init__(self) -> None:
         """ValueError: what cannot be a machine, with the field, what is wanted and what it got."""
         python_numbers(self)
-        require(len(self.joints) > 0, "joints", "one Joint or more", self.joints)
+        joints: Any = self.joints  # of a user, who may have given anything
+        some = isinstance(joints, tuple) and joints and all(isinstance(j, Joint) for j in joints)
+        require(bool(some), "joints", "a tuple of one Joint or more", joints)
         slower = min(self.rate, self.tool_speed)
         require(slower > 0, "rate, tool_speed", "positive numbers", slower)
         bits = self.encoder_bits
         require(1 <= bits <= 32, "encoder_bits", "1 to 32", bits)
         for j in self.joints:
-            pair = np.shape(j.dead_zone) == (2,)
+            pair = is_row(j.dead_zone, 2)
             require(pair, f"{j.name}.dead_zone", "a pair, up and down", j.dead_zone)
             slower = min(j.q_dot_up, j.q_dot_down)
             require(slower > 0, f"{j.name}.q_dot_up, q_dot_down", "positive numbers", slower)
@@ -174,9 +182,11 @@ class Machine:
         opens = bool(((zones >= 0) & (zones < limit / PWM_MAX)).all())  # else no valve ever does
         require(opens, "dead_zone", f"0 to {limit}/{PWM_MAX}", zones.tolist())
         require(2 <= samples <= self.history, "velocity_samples", "2 to history", samples)
-        inside = [j.q_min <= q <= j.q_max for j, q in zip(self.joints, self.q_start)]
-        fits = len(self.q_start) in (0, self.n) and all(inside)
+        fits = self.q_start == () or is_row(self.q_start, self.n)
+        fits = fits and all(j.q_min <= q <= j.q_max for j, q in zip(self.joints, self.q_start))
         require(fits, "q_start", f"{self.n} angles within their ranges", self.q_start)
+        known = 0 < self.valve_frame_id < 0x800
+        require(known, "valve_frame_id", "an identifier of 11 bits", self.valve_frame_id)
 
 
 # Joints of the Brokk 170. Sources: all assumed, but the nominal speeds of q5 (paper, Sec. 3.2).

@@ -36,6 +36,7 @@ class Shadow(hw.Drive):
         self.nodes.nmt[:] = canopen.OPERATIONAL  # until they say otherwise
         self.pairs: list[tuple[Array, Array]] = []  # u that it would send, that was sent
         self.faults: Counter[str] = Counter()  # ticks with each
+        self.quiet = 0  # ticks since the last position of any joint
 
     def begin(self) -> None:
         """Start the clock, and nodes if it may. ValueError: see `canopen.check_bus`."""
@@ -57,7 +58,8 @@ class Shadow(hw.Drive):
             due = self.positions_time + (1 - EARLY) * self.machine.dt
             self.start_time = due - self.deadline_number * self.machine.dt
         super().wait()
-        if (fault := str(self.gate.active_fault)) and self.ticks > 2:  # the first tick is late
+        fault = "" if self.quiet else str(self.gate.active_fault)
+        if fault and self.ticks > 2:  # the first tick is late
             self.faults[fault] += 1
         self.nodes.frames[:] = 0  # somebody else may ask more often
         self.nodes.heartbeat[:] = self.bus.now()  # nobody has set up heartbeats
@@ -72,6 +74,7 @@ class Shadow(hw.Drive):
     def control(self, counts: Counts) -> Array:
         """The controller's command u (n,)."""
         answered = self.nodes.frames > 0
+        self.quiet = 0 if answered.any() else self.quiet + 1
         if answered.any() and not answered.all():  # it has waited for the others
             self.positions_time += self.machine.dt
         else:
@@ -90,5 +93,7 @@ class Shadow(hw.Drive):
             lines.append(f"  {m.names[i]}: correlation {r}, mean difference {difference:+.1f}")
         if np.isinf(self.nodes.valve_time):
             lines.append(f"no valve frame with identifier 0x{m.valve_frame_id:X} came")
+        if self.quiet > 1:
+            lines.append(f"no positions came in the last {self.quiet * m.dt:.1f} s")
         lines += [f"the gate would have stopped {k} ticks: {f}" for f, k in self.faults.items()]
         return "\n".join(lines)

@@ -30,7 +30,9 @@ def joint_names(dataset: Path) -> tuple[list[str], list[str]]:
     both = []
     for key in (ANGLES, COMMANDS):
         names = info["features"][key].get("names")
-        names = next(iter(names.values())) if isinstance(names, dict) else names
+        if isinstance(names, dict):  # {"motors": [...]}, or each name's place
+            lists = [value for value in names.values() if isinstance(value, list)]
+            names = lists[0] if lists else sorted(names, key=names.get)
         names = names or (both[0] if both else [f"joint_{i}" for i in range(shapes[0][0])])
         both.append([name.removesuffix(".pos") for name in names])
     angles, commands = both

@@ -114,6 +114,9 @@ def test_load_arrays__reads_the_header_first(tmp_path):
         archive.writestr("x.npy", head.getvalue())
     with pytest.raises(ValueError, match=r"expected policy 8 .*, got None"):
         files.load_arrays(tmp_path / "x.npz", "policy 8")
+    np.savez(tmp_path / "list.npz", header="[1, 2]")
+    with pytest.raises(ValueError, match=r"expected policy 8 .*, got \[1, 2\]"):
+        files.load_arrays(tmp_path / "list.npz", "policy 8")
 
 
 def test_whole_file__keeps_what_another_program_wrote_meanwhile_and_the_new_file_beside(tmp_path):

@@ -52,6 +52,10 @@ def test_main__finds_actions_by_their_names(tmp_path):
     log = read_log(tmp_path / "log.npz", BROKK_170)
     np.testing.assert_allclose(np.concatenate([one.u for one in log.recordings]), u[:, ::-1])
     write_dataset(tmp_path / "other", NAMES, actions=["boom.pos", "x"])
+    places = {"arm.pos": 1, "boom.pos": 0}
+    write_dataset(tmp_path / "places", places, actions=NAMES)
+    main(str(tmp_path / "places"), str(tmp_path / "log.npz"))
+    assert read_log(tmp_path / "log.npz", BROKK_170).joints == ("boom", "arm")
     with pytest.raises(SystemExit, match=r"expected action of \['boom', 'arm'\], got .*'x'"):
         main(str(tmp_path / "other"), str(tmp_path / "log.npz"))
 

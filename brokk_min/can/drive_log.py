@@ -20,8 +20,13 @@ from brokk_min.machine import Array, Machine, require
 # terminal candump prints (time)  bus  identifier   [length]  data; with -x RX - - before the
 # identifier, with -a the letters of the data after it, with -8 two digits of the length.
 LINE = re.compile(
-    r" ?\((\d+\.\d+)\) +(\S+) +(?:[RT]X \S+ \S+ +)?([0-9A-Fa-f]{3})(?:#| +\[0?\d\] *)"
+    r" ?\((\d+\.\d+)\) +(\S+) +(?:[RT]X \S+ \S+ +)?([0-9A-Fa-f]{3})(?:#| +\[0?(\d)\] *)"
     r"((?:[0-9A-Fa-f]{2} ?){0,8})(?: *'.*')?(?: ([RT]))?\n"
+)
+# Other frames: with 29 bits, of an error, remote, or of more than eight bytes.
+OTHER = re.compile(
+    r" ?\(\d+\.\d+\) +\S+ +(?:[RT]X \S+ \S+ +)?"
+    r"(?:[0-9A-Fa-f]{8}[# ]|[0-9A-Fa-f]{3}(?:#R|##|#\w{16}_| +\[(?:\d{2}|9)\]| +\[0\] +remote)).*\n"
 )
 NOTES = ("operator", "timing", "valves", "shadow")  # no buses: what `drive` notes beside the frames
 OTHERS = (".asc", ".blf", ".trc", ".gz")  # that python-can reads
@@ -31,7 +36,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
     """The data frames of a log with 11 bits, one by one, because a day of driving has millions.
 
     Other frames are left out, and a last line without its newline: the program that wrote it was
-    killed. ValueError: no such log, frames of two buses, a line without a time, or none understood.
+    killed. ValueError: no such log, frames of two buses, or a line that is none of candump's.
     """
     buses: dict[Any, None] = {}
     if Path(path).suffix.lower() in OTHERS:
@@ -43,15 +48,18 @@ def read_frames(path: Path) -> Iterator[Frame]:
                     yield frame
         return
     strange = ""
-    with expected(path, "a candump log"), open(path, encoding="ascii") as file:
+    with expected(path, "a candump log"), open(path, encoding="utf-8-sig") as file:
         for row, line in enumerate(file, 1):
             wanted = "(time) bus identifier#data, as candump -l writes"
-            require(line.lstrip().startswith("("), f"row {row}", wanted, brief(line))
+            wanted += " (tables have names in .csv or .npz)" if row == 1 else ""
             if match := LINE.fullmatch(line):
-                time, bus, can_id, data, direction = match.groups()
+                time, bus, can_id, length, digits, direction = match.groups()
+                data = bytes.fromhex(digits)
+                require(int(length or len(data)) == len(data), f"row {row}", wanted, brief(line))
                 one_bus(buses, bus)
-                yield Frame(float(time), int(can_id, 16), bytes.fromhex(data), direction == "T")
+                yield Frame(float(time), int(can_id, 16), data, direction == "T")
             elif line.endswith("\n"):
+                require(bool(OTHER.fullmatch(line)), f"row {row}", wanted, brief(line))
                 strange = strange or f"row {row}: {brief(line)}"
         require(bool(buses) or not strange, str(path), "data frames of 11 bits", strange)
 

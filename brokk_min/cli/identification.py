@@ -57,7 +57,8 @@ class ReadsLogs(Command):
 
         The joints are in the order of the machine, of which locked ones may be missing.
         """
-        check(len(paths) > 0, "LOGS", "one file or more", "none")
+        once = len({path.resolve() for path in paths}) == len(paths) > 0
+        check(once, "LOGS", "one file or more, each once", " ".join(map(str, paths)) or "none")
         tables = not self.map or any(map(is_table, paths))
         check(tables, "--map", "a table or a recording of ROS", paths[0])
         log = logs.join_logs({path: self.read_log(path, machine) for path in paths})
@@ -135,12 +136,13 @@ class Fit(ReadsLogs):
                 test = logs.in_order(self.read_logs(self.test, machine)[0], log.joints)
                 twins = inspection.repeated(test.recordings, log.recordings)
                 require(not twins, "--test", "recordings that LOGS has not", brief(twins))
+            every = log._replace(recordings=(*log.recordings, *test.recordings))
         else:
-            log, test = logs.split(log)
-        reports = inspection.inspect(log, known)
-        for wrong in inspection.wrong_signs(reports):
+            every, (log, test) = log, logs.split(log)
+        reports = inspection.inspect(every, known)
+        for wrong in (*inspection.wrong_signs(reports), *inspection.mixed_up(reports)):
             raise ValueError(f"{self.logs[0]}: {wrong}")
-        warnings = [*inspection.warnings(log, reports, known)]
+        warnings = [*inspection.warnings(every, reports, known)]
         print(*(f"warning: {one}\n" for one in warnings), sep="", end="", flush=True)
         name = known.name if known else ""
         net = fitting.fit_nets(log, settings, self.seed, machine, name)

@@ -92,7 +92,8 @@ class DriveMachine(Command):
         if isinstance(drive, Shadow):
             print(drive.report())
         played = not isinstance(operator, Script) or operator.done
-        require(played, "drive", "to play all sequences", drive.reason or "a stop")
+        busy = " (a busy computer? chrt -f 10 before the command)" if "late" in drive.reason else ""
+        require(played, "drive", "to play all sequences", f"{drive.reason or 'a stop'}{busy}")
 
     def find_controller(self, machine: Machine) -> Controller:
         """The controller that is named."""

@@ -125,8 +125,9 @@ def find_plant(name: str, machine: Machine) -> Plant:
     """
     if name == "analytic":
         if stands_in(machine):
-            what = "--plant: expected one of your own, or net, got a machine without hydraulics"
-            print(f"{what}: those of the analytic plant are made up", file=sys.stderr)
+            got = "a machine without hydraulics: those of the analytic plant are made up"
+            warning = f"warning: --plant: expected one of your own, or net, got {got}"
+            print(warning, file=sys.stderr)
         return PLANT
     plant = OwnPlant(name, load_object("--plant", name))
     low, high = machine.column("q_min"), machine.column("q_max")
@@ -159,8 +160,10 @@ class OwnPlant:
 
     def checked(self, method: str, shape: tuple[int, ...], *arguments: Any) -> Any:
         """ValueError: whatever the file does, or a state without finite angles of this shape."""
+        before = os.getcwd()
         with expected(Path(self.name), "a plant whose states have angles q"):
             state = getattr(self.plant, method)(*arguments)
+            os.chdir(before)  # paths are those of the shell
             q = np.asarray(state.q, float)
             require(q.shape == shape, "angles q of a state", f"an array {shape}", q.shape)
             require(bool(np.isfinite(q).all()), "angles q of a state", "finite numbers", brief(q))

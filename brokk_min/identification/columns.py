@@ -104,7 +104,12 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
     unread = np.isnan(result) & name.startswith("q_")
     for row in np.flatnonzero(~(np.abs(result) <= limit) & ~unread):  # also where it is nan
         largest = np.fmax.reduce(np.abs(result), initial=0.0)  # but nan
-        units = {100: "percent", 127: "0.00787", 255: "UNIT", 1000: "permille"}  # 1 / 127
+        units = {
+            100: "percent or :0.00787",
+            127: "0.00787",
+            255: "UNIT",
+            1000: "permille",
+        }  # 1 / 127
         unit = next((name for most, name in units.items() if largest <= most), "UNIT")
         wanted = f"-{limit:g} to {limit:g}"
         wanted += f" (another unit? --map {name}=COLUMN:{unit}; rest is 0)" if command else ""

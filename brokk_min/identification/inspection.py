@@ -351,9 +351,18 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
     for name, report in reports.items():
         wanted = f"u_{name}: expected positive commands to raise q_{name}"
         if report.sign < 0:
-            yield f"{wanted}, got falling angles (--map {name}=COLUMN:-1, or :-deg)"
+            got = f"falling angles (--map {name}=COLUMN:-1 or :-deg; if the angle is right"
+            yield f"{wanted}, got {got}, u_{name}=COLUMN:-1)"
         if report.opposite:
             yield f"{wanted} in all recordings or in none, got some in {brief(report.opposite)}"
+
+
+def mixed_up(reports: Mapping[str, JointReport]) -> Iterator[str]:
+    """Joints that move by the commands of another one, in words."""
+    for name, r in reports.items():
+        if r.other:
+            got = f"motion by u_{r.other}: are columns mixed up?"
+            yield f"{name}: expected motion by u_{name}, got {got}"
 
 
 Check = tuple[Any, str, str, str]  # if it holds: the place, what was expected there, what it got

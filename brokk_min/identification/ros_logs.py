@@ -16,6 +16,7 @@ from brokk_min.machine import Array, require
 
 STATE = "sensor_msgs/msg/JointState"
 ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
+FIELDS = ("position", "velocity", "effort")  # of a JointState
 COMMAND_TIME = "time of commands"  # the column with their stamps
 LATE = 0.01  # s, assumed: differences between the delays of messages that are worth a word
 OLD = 0.5  # s, and five usual periods, assumed: no machine waits so long for a command
@@ -28,13 +29,17 @@ def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], li
     Both in ROS's units. ValueError: no rosbags, no recording, no such topic or another type of
     message, or commands that do not fit the angles.
     """
+    folder = not path.is_dir() or (path / "metadata.yaml").exists()
+    require(
+        folder, str(path), "a folder of ROS, with metadata.yaml (several: all their names)", "none"
+    )
     reader_of = require_package("rosbags.highlevel", "ros").AnyReader
     types = require_package("rosbags.typesys", "ros")
     store = types.get_typestore(types.Stores.ROS2_HUMBLE)  # of bags without definitions
     found: dict[str, list[tuple[float, Any]]] = {angles: [], commands: []}
     with expected(path, "a recording of ROS"), reader_of([path], default_typestore=store) as bag:
         for topic in (angles, commands):
-            require(topic in bag.topics, f"{path}: --topics", f"two of {[*bag.topics]}", topic)
+            require(topic in bag.topics, f"{path}: --topics", f"topics of {[*bag.topics]}", topic)
         chosen = [one for one in bag.connections if one.topic in found]
         for one in chosen:
             kinds = (STATE,) if one.topic == angles else (STATE, *ARRAYS)
@@ -44,8 +49,8 @@ def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], li
         (times, q_warnings), (u_times, u_warnings) = (clock(*item) for item in found.items())
         states, orders = [message for _, message in found[angles]], [m for _, m in found[commands]]
         names = [*dict.fromkeys(name for state in states for name in state.name)]
-        q = [(t, joints_of(state, names)) for t, state in zip(times, states, strict=True)]
-        u = [(t, joints_of(order, names)) for t, order in zip(u_times, orders, strict=True)]
+        q = [(t, joints_of(state, names, FIELDS[:1])) for t, state in zip(times, states)]
+        u = [(t, joints_of(order, names, FIELDS)) for t, order in zip(u_times, orders)]
         table = columns_of(q, u)
     several = hasattr(orders[0], "data") and any([*state.name] != names for state in states)
     order = [f"{commands}: expected one order of the joints, took {names}"] if several else []
@@ -57,7 +62,8 @@ def clock(topic: str, messages: list[tuple[float, Any]]) -> tuple[Array, list[st
     recorded = np.array([time for time, _ in messages])
     heads = [getattr(message, "header", None) for _, message in messages]
     stamps = np.array([h.stamp.sec + h.stamp.nanosec / 1e9 if h else 0.0 for h in heads])
-    if not stamps.all() or (np.diff(stamps) < 0).any():
+    steps = np.diff(stamps)
+    if not stamps.all() or (steps < 0).any() or not steps.any():  # nobody has set them
         return recorded, []
     late = recorded - stamps
     least, usual = np.quantile(late, (0, 0.9))
@@ -66,14 +72,17 @@ def clock(topic: str, messages: list[tuple[float, Any]]) -> tuple[Array, list[st
     return stamps + least, [told] if usual - least > LATE else []
 
 
-def joints_of(message: Any, names: list[str]) -> dict[str, float]:
-    """Angles or commands by joint; ValueError: other numbers of them than of joints."""
+def joints_of(message: Any, names: list[str], fields: tuple[str, ...]) -> dict[str, float]:
+    """Angles or commands by joint, those of the first of `fields` that is filled, or none.
+
+    ValueError: other numbers of them than of joints.
+    """
     if hasattr(message, "data"):
         wanted = f"one of each {names} (a JointState says by itself which joints it has)"
         require(len(message.data) == len(names), "commands", wanted, brief([*message.data]))
         return dict(zip(names, message.data, strict=True))
-    filled = (x for x in (message.position, message.velocity, message.effort) if len(x))
-    return dict(zip(message.name, next(filled, []), strict=True))
+    filled = [x for x in (getattr(message, field) for field in fields) if len(x)]
+    return dict(zip(message.name, filled[0], strict=True)) if filled else {}
 
 
 def columns_of(q: Values, u: Values) -> dict[str, Any]:

@@ -93,6 +93,8 @@ def _rms(error: Array) -> float:
 def warnings(scores: Mapping[str, Any]) -> Iterator[str]:
     """A warning for each net of `score` that is no better than the last velocity again."""
     for name, one in scores.items():
+        if not np.isfinite(one.get("one_step_rmse", np.nan)):
+            yield f"{name}: expected a recording to score on in which it moves (--test), got none"
         if one.get("one_step_rmse", 0) > one.get("persistence_rmse", 0):
             yield f"{name}: expected a net that errs less than the last velocity again, got more"
 

@@ -33,7 +33,8 @@ def describe(machine: Machine, known: Known) -> Iterator[str]:
         after = f"after {seconds[i, side]:.0f} s of motion"
         yield f"{name}: {speed} than in the logs, {zone}, {after}"
     if at_bounds.any():
-        yield "at least one valve is beyond what can be learned here: log and fit the machine again"
+        end = "log and fit the machine again, with commands like these"
+        yield f"at least one valve is beyond what can be learned here: {end}"
 
 
 def save_known(path: Path, machine: Machine, net: ActuatorNet, known: Known) -> None:

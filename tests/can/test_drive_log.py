@@ -64,9 +64,13 @@ def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
     (tmp_path / "log.csv").write_text("(1.0) can0 123#0102\nrun,time,u_a,q_a\n")
     with pytest.raises(ValueError, match=r"log.csv: row 2: expected .time. bus"):
         list(read_frames(tmp_path / "log.csv"))
-    (tmp_path / "log.csv").write_text("(1.0) can0 12345678#01\n(2.0) can0 RTR 123\n")
+    (tmp_path / "log.csv").write_text("(1.0) can0 12345678#01\n(2.0) can0 123#R\n")
     with pytest.raises(ValueError, match=r"expected data frames of 11 bits, got row 1: .*345678#"):
         list(read_frames(tmp_path / "log.csv"))
+    for line in ("123#0102 and more", "123#01.02", "123   [2]  02`01", "123   [1]  00000001"):
+        (tmp_path / "log.csv").write_text(f"(1.0) can0 123#0102\n(2.0) can0 {line}\n")
+        with pytest.raises(ValueError, match=r"row 2: expected .*, got '\(2.0\) can0 123"):
+            list(read_frames(tmp_path / "log.csv"))
     two = "(1.0) can0 123#01\n(2.0) operator 7FF#01\n(3.0) can1 123#02\n"
     (tmp_path / "log.csv").write_text(two)
     with pytest.raises(ValueError, match=r"frames of one bus .*, got can0 and can1"):

@@ -69,7 +69,14 @@ def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys)
     assert run(f"fit {TINY}", log, "--out", tmp_path / "n.npz") == 1
     reversed_one = "u_arm: expected positive commands to raise q_arm"
     assert f"log.csv: {reversed_one}" in capsys.readouterr().err
+    table = foreign_log(tmp_path / "sound.csv", 0, 2).read_text()
+    head, _, rows = table.partition("\n")
+    swapped = head.replace("u_boom", "u_x").replace("u_arm", "u_boom").replace("u_x", "u_arm")
+    (tmp_path / "swapped.csv").write_text(f"{swapped}\n{rows}")
+    assert run(f"fit {TINY}", tmp_path / "swapped.csv", "--out", tmp_path / "n.npz") == 1
+    assert "expected motion by u_arm, got motion by u_boom" in capsys.readouterr().err
     assert not (tmp_path / "n.npz").exists()
+    assert run("inspect", log, log) == 2 and "each once" in capsys.readouterr().err
     assert run("inspect", log) == 0
     assert f"warning: {reversed_one}" in capsys.readouterr().out
 

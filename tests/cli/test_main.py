@@ -144,7 +144,7 @@ VIRTUAL = "drive --interface virtual --channel v"
         ("evaluate --seed -1", 2, "--seed: expected 0 or more, got -1"),
         ("reproduce --seed -1", 2, "--seed: expected 0 or more, got -1"),
         ("collect --out x.csv --machine digger", 2, "--machine: expected brokk170 or FILE.py"),
-        ("inspect", 2, "LOGS: expected one file or more, got none"),
+        ("inspect", 2, "LOGS: expected one file or more, each once, got none"),
         ("inspect drive.log --map q1=boom:deg", 2, "--map: expected a table or a recording"),
         ("fit missing.csv --out n.npz", 1, "missing.csv: no such file or directory"),
         ("fit l.csv --out n.npz --no-valve --members 3", 2, "--members: expected 1 of nets"),

@@ -33,6 +33,13 @@ class Own(AnalyticPlant):
 
 OWN, REVERSED, BROKEN, DEGREES = Own(), Own(-1.0), Own(scale=float("nan")), Own(scale=57.3)
 FEWER, ENDS = Own(joints=4), Own(ends=60)
+
+class Moves(Own):
+    def reset(self, machine, q):
+        import os; os.chdir("/")
+        return super().reset(machine, q)
+
+MOVES = Moves()
 """
 
 
@@ -113,6 +120,9 @@ def test_find_plant__tries_each_joint(file):
     }.items():
         with pytest.raises(ValueError, match=message):
             find_plant(f"{file}:{name}", BROKK_170)
+    before = Path.cwd()
+    find_plant(f"{file}:MOVES", BROKK_170)
+    assert Path.cwd() == before
     plant = find_plant(f"{file}:ENDS", BROKK_170)
     state = plant.reset(BROKK_170, q)
     with pytest.raises(ValueError, match=r":ENDS: expected a plant .* got SystemExit\(0\)"):

@@ -214,6 +214,26 @@ def test_inspect__names_recordings_in_which_commands_do_not_move_the_joint(share
     assert (everywhere.still == ["0"]) == (share == 0)
 
 
+def test_inspect__names_short_stalls_and_a_joint_that_sags():
+    """Neither is taken for a wrong sign, nor is a joint that rests, whose velocity is rounding."""
+
+    def stalls(one):
+        steps = np.diff(one.q, axis=0, prepend=one.q[:1])
+        steps[400:500] = 0  # for 5 s
+        return one._replace(q=one.q[0] + np.cumsum(steps, axis=0))
+
+    def sags(one):
+        return one._replace(q=one.q[0] - 0.0005 * np.arange(len(one.q))[:, None] * [1, 0])
+
+    for change in (stalls, sags):
+        report = boom(*SEVEN, change=change)
+        assert report.still == ["0", "3", "6"] and report.opposite == []
+        assert report.explained > 0.95
+    rests = record("boom", 0.1 * np.sin(np.arange(4000)))
+    rests = rests._replace(name="rests", q_dot=rests.q_dot - 1e-16 * np.sign(rests.u))
+    assert inspect(log_of(*(record("boom", u) for u in SEVEN), rests))["boom"].opposite == []
+
+
 def test_inspect__tells_steps_of_an_encoder_and_noise_from_another_motion():
     step, rng = np.deg2rad(1.0), np.random.default_rng(0)
     for spoil in (lambda q: np.rint(q / step) * step, lambda q: q + rng.normal(0, 0.008, q.shape)):

@@ -88,6 +88,20 @@ def test_read_ros__says_which_order_it_took_of_nodes_with_other_ones(tmp_path):
     assert warnings[0] == "/valves: expected one order of the joints, took ['boom', 'arm']"
 
 
+def test_read_ros__leaves_out_empty_messages_and_stamps_that_nobody_has_set(tmp_path):
+    """A driver publishes before its first read; velocities are no angles."""
+    messages = [(99.9, "/valves", multi_array([0.5]))]
+    for k in range(20):
+        q = joint_state(["boom"], [0.01 * k] if k > 2 else [], velocity=[9.0], stamp=7.0)
+        messages.append((100 + k / 20, "/joint_states", q))
+    table, warnings = read_ros(record(tmp_path / "bag", messages), "/joint_states", "/valves")
+    np.testing.assert_allclose(table["time"] - 100, np.arange(3, 20) / 20, atol=1e-6)
+    np.testing.assert_allclose(table["q_boom"], 0.01 * np.arange(3, 20))
+    assert warnings == []
+    with pytest.raises(ValueError, match=r"expected a folder of ROS, with metadata.yaml"):
+        read_ros(tmp_path, "/joint_states", "/valves")
+
+
 def test_read_ros__warns_of_a_command_that_holds_for_long(tmp_path):
     messages = drive(lambda k: multi_array([0.5, 0.0, 0.5]))
     later = [(t + 3, topic, message) for t, topic, message in messages]
@@ -98,7 +112,7 @@ def test_read_ros__warns_of_a_command_that_holds_for_long(tmp_path):
 
 def test_read_ros__names_what_is_missing(tmp_path):
     path = record(tmp_path / "bag", drive(lambda k: multi_array([0.0, 0.0])))
-    with pytest.raises(ValueError, match=r"bag: --topics: expected two of .*/valves.*got /u"):
+    with pytest.raises(ValueError, match=r"bag: --topics: expected topics of .*/valves.*got /u"):
         read_ros(path, "/joint_states", "/u")
     with pytest.raises(ValueError, match=r"commands: expected one of each \['boom', 'wheel', "):
         read_ros(path, "/joint_states", "/valves")

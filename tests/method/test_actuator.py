@@ -110,10 +110,15 @@ DT = "hydraulics.dt: expected a whole part of 1/rate, not above any tau"
 BAD = [
     ({"cylinder": {"rod": -0.1}}, "q5.rod: expected a positive number, got -0.1"),
     ({"cylinder": {"speed": 0.1}}, "q5.speed: expected a pair, up and down, got 0.1"),
+    ({"cylinder": {"speed": (np.nan, 0.1)}}, "q5.speed: expected a pair, up and down, got (nan"),
+    ({"gain": (np.nan, 1.0)}, "hydraulics: expected a delay and a pair of gains of 0 or more"),
     ({"cylinders": {"boom": Cylinder()}}, "cylinders: expected those of joints ['q1', 'q2', "),
     ({"cylinder": {"angle": 0.0}}, "q5.angle: expected angles in (0, pi), got 0.000 to 2.000"),
     ({"cylinder": {"angle": 1.2}}, "q5.angle: expected angles in (0, pi), got 1.200 to 3.200"),
-    ({"delay": -0.1}, "hydraulics: expected delay and gain of 0 or more, got Hydraulics("),
+    (
+        {"delay": -0.1},
+        "hydraulics: expected a delay and a pair of gains of 0 or more, got Hydraulics(",
+    ),
     *[({"dt": 0.02}, f"{DT}, got 0.02"), ({"rate": 30.0}, DT), ({"dt": -0.005}, DT)],
     *(({f"tau_{x}": 0.004}, DT) for x in ("spool", "cylinder", "valve_up", "valve_down")),
 ]
