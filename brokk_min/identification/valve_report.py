@@ -76,4 +76,6 @@ def from_log(machine: Machine, net: ActuatorNet, log: Log) -> Known:
         later, runs = learn(machine, net, known, runs, history)
         for old, new in zip(known, later):
             old[t < length] = new[t < length]
-    return Known(*(of.sum(axis=0, keepdims=True) for of in known))
+    told = Known(*(of.sum(axis=0, keepdims=True) for of in known))
+    told.A[..., 1, :, :] = told.b[..., 1, :] = 0.0  # the last seconds of each recording
+    return told

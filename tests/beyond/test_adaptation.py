@@ -89,16 +89,18 @@ def test_valves__by_hand_one_valve_that_is_sure_draws_the_mean_and_no_evidence_c
     k, d = valves(unknown((1, 4)))
     assert (k == 1).all() and (d == 0).all()
     known = unknown((1, 4))
-    known.A[0, 0, 0, 0, 0], known.b[0, 0, 0, 0] = 1e6, -0.2e6  # of q1 up: k = 0.8, certainly
+    known.A[0, 0, 0, 0, 0, 0], known.b[0, 0, 0, 0, 0] = 1e6, -0.2e6  # of q1 up: k = 0.8, certainly
     k, _ = valves(known)
-    own, shared = adaptation.OWN[0] ** 2, adaptation.SHARED[0] ** 2
+    own, shared = adaptation.OWN[0][0] ** 2, adaptation.SHARED[0][0] ** 2
     mean = -0.2 * shared / (own + shared)  # what it says of the mean of all
     ratio = 0.2 * 0.2e6  # of log-likelihoods: 2 b x - A x^2
-    shrunk = 1 - adaptation.LIKELIER / ratio
+    shrunk = 1 - adaptation.LIKELIER[0] / ratio
     assert k[0, 0, 0] == pytest.approx(1 - 0.2 * shrunk, abs=1e-5)
     np.testing.assert_allclose(k[0].ravel()[1:], 1 + mean * shrunk, atol=1e-5)
+    known.A[0, 0, 0, 1, 0, 0], known.b[0, 0, 0, 1, 0] = 1e6, 0.1e6  # of late k = 1.1
+    assert valves(known)[0][0, 0, 0] == pytest.approx(1.1, abs=1e-3)
     known.A[:], known.b[:] = 0, 0
-    known.A[0, 0, 0, 0, 0], known.b[0, 0, 0, 0] = 10, -2  # little is known
+    known.A[0, 0, 0, 0, 0, 0], known.b[0, 0, 0, 0, 0] = 10, -2  # little is known
     assert (valves(known)[0] == 1).all()
 
 
