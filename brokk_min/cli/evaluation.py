@@ -81,7 +81,7 @@ class Evaluate(Command):
         self, machine: Machine, net: ActuatorNet, plant: Plant, path: Path | None
     ) -> dict[str, JacobianController]:
         """The baselines with the gains of a file, or with gains that are tuned now."""
-        print(f"gains of the baselines: {path or 'tuned now'}", file=sys.stderr)
+        print(f"gains of the baselines: {path or 'tuned now, for minutes'}", file=sys.stderr)
         if path:
             return load_pids(machine, path, net)
         tuned = baselines.tuned_baselines(machine, net, baselines.EFFORT, self.seed, plant)

@@ -101,7 +101,8 @@ class Train(Training):
         hint = f"--policy {self.out}"
         if machine != BROKK_170:
             hint += f" --machine {self.machine}"
-        print(f"{self.out}: trained; curve in {self.out}.csv; `brokk-min play {hint}`")
+        curve = f"curve, as it explores on the nets, in {self.out}.csv"
+        print(f"{self.out}: trained; {curve}; `brokk-min play {hint}`")
 
 
 @dataclass(kw_only=True)

@@ -95,13 +95,14 @@ def task_claims(runs: Sequence[Run]) -> list[dict[str, Any]]:
 def verdict_rows(claims: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """A table of all claims: figure, the paper's words, what is judged, its figures, its verdict.
 
-    Of the comparisons with PIDs it has those with the optimised one.
+    Of the comparisons with PIDs it has those with the optimised one, and others that end otherwise.
     """
     rows = []
     for claim in claims:
         for judged, numbers in claim["numbers"].items():
-            _, against, pid = judged.partition(" against ")
-            if not against or pid == TITLES[OPTIMISED]:
+            policy, against, _ = judged.partition(" against ")
+            usual = f"{policy} against {TITLES[OPTIMISED]}" if against else judged
+            if judged == usual or claim["verdicts"][judged] != claim["verdicts"].get(usual):
                 texts = [f"{what} {interval_text(number)}" for what, number in numbers.items()]
                 words = [claim["figure"], claim["paper"], judged, "; ".join(texts)]
                 rows.append([*words, claim["verdicts"][judged]])
