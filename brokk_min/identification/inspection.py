@@ -9,6 +9,7 @@ A grid gives delay, lag and dead zones, and least squares give the gains. Sample
 recorded range do not count, because a joint that is pushed against its stop stands still.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import compress, product
 from typing import Any, NamedTuple
@@ -42,6 +43,7 @@ USUALLY, SOUND = 4.0, 0.6  # so many times the quantile of the log's, of sound o
 AT_LEAST = (0.9, 0.3)  # s, if less or more of the motion is explained than
 WELL = 0.9  # as without noise, without coarse steps, and where valves open at once
 RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
+SAME, ROUNDED = 20, 1e-3  # samples of the same commands, and rad, up to which motion is the same
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
 LEAST_RANGE = 0.7  # of a joint's range
@@ -454,17 +456,27 @@ def warnings(
 
 
 def repeated(recordings: Sequence[Recording], others: Sequence[Recording]) -> list[str]:
-    """Names of recordings with the same numbers as one before them, or as one of others.
+    """Names of recordings with the commands and motion of one before them, or of one of others.
 
-    A table may have rounded them. What does not move is no recording that counts.
+    Half of it is enough, and a table may have rounded it. What does not move does not count.
     """
     every, twins = [*others, *recordings], []
-    sums = np.array([(one.u.size, one.u.sum(), one.q.sum()) for one in every])
-    for i, one in enumerate(recordings, len(others)):
-        near = np.flatnonzero((np.abs(sums[:i] - sums[i]) < 1e-5 * one.u.size).all(axis=1))
-        alike = [every[k] for k in near if every[k].u.shape == one.u.shape]
-        same = (np.allclose(other[1:3], one[1:3], rtol=0, atol=1e-5) for other in alike)
-        twins += [one.name] if any(same) and moving(one).any() else []
+    places: dict[int, tuple[int, int]] = {}  # recording and row, by what is commanded from there on
+    for i, one in enumerate(every):
+        parts = sliding_window_view(one.u.round(4) + 0.0, min(SAME, len(one.u)), axis=0)
+        keys = [
+            hash(part.tobytes()) if np.ptp(part, axis=-1).max() > COMMANDED else 0 for part in parts
+        ]
+        found = [(places[key], row) for row, key in enumerate(keys) if key in places]
+        shifts = Counter((k, first - row) for (k, first), row in found)
+        (k, shift), rows = max(shifts.items(), key=lambda item: item[1], default=((0, 0), 0))
+        if rows > sum(map(bool, keys)) / 2 and i >= len(others):
+            ours, theirs = one.q[max(-shift, 0) :], every[k].q[max(shift, 0) :]
+            n = min(len(ours), len(theirs))
+            apart = np.ptp(ours[:n] - theirs[:n], axis=0).max()
+            moved = np.ptp(one.q, axis=0).max() > MOVED
+            twins += [one.name] if apart < ROUNDED and moved else []
+        places |= {key: (i, row) for row, key in enumerate(keys) if key and key not in places}
     return twins
 
 

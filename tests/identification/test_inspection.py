@@ -287,6 +287,11 @@ def test_repeated__names_recordings_that_are_there_twice():
     again = first._replace(name="again", q=first.q.round(6))
     rest = Recording("rest", *(np.zeros((50, 2)) for _ in range(3)))
     assert repeated([first, other, again, rest, rest], ()) == ["again"]
+    part = Recording("part", *(x[7:3000] for x in first[1:]))
+    moved = first._replace(name="moved", q=first.q + 0.1)
+    assert repeated([other, first, part, moved], ()) == ["part", "moved"]
+    again_driven = first._replace(name="driven", q=first.q * 1.01)
+    assert repeated([first, again_driven], ()) == []
     assert repeated([other, again], [first]) == ["again"]
     log = log_of(first, again)
     assert "recordings: expected each once, got again ['again']" in warnings(log, {}, None)
