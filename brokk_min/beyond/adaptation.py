@@ -16,7 +16,7 @@ the controller asks for becomes o / k - d, and in its history it sees the comman
 done the same to the valves of its logs.
 
 What it buys (`python -m benchmarks.adaptation`): with valves 20 % slower our agent's error is
-0.0123 m/s and not 0.0210 m/s, and after a minute 0.0114 m/s, which is that of a controller that
+0.0122 m/s and not 0.0210 m/s, and after a minute 0.0114 m/s, which is that of a controller that
 knows its valves. Where nothing is wrong nothing changes.
 
 Who was first: self-tuning regulators (Astrom and Wittenmark, 1973); Jensen et al. (2020) adapt two
