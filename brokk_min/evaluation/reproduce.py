@@ -54,7 +54,7 @@ class Budget:
     short_s: float = 26.0  # s, longest run for robustness
 
 
-QUICK = Budget(0.3, 2000, 400_000, (4, 8, 10.0), 4, 3.0)
+QUICK = Budget(0.3, 1300, 400_000, (4, 8, 10.0), 4, 3.0)
 
 
 @dataclass(frozen=True)
