@@ -108,22 +108,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     u, q = (np.concatenate([x[:, j] for x in of]) for of in list(zip(*recordings))[1:3])
     span = (q.min(), q.max())
     each = [motion_of([one], j, rate, span) for one in recordings]
-    still = np.array([np.ptp(one.q[:, j]) <= MOVED for one in recordings])
-    held = [np.convolve(one.u[:, j], np.ones(round(rate)) / rate, "valid") for one in recordings]
-    stuck = still & [min(x.max(), -x.min()) > OPENS for x in held]  # a stop it would leave one way
-    for _ in range(4):  # again without those in which it stands still, until they are found
-        before = still
-        kept = [*compress(recordings, ~still | still.all())]
-        motion = motion_of(kept, j, rate, span)
-        model = fit_model(motion)
-        seconds = np.array([still_seconds(one, model, motion) for one in each])
-        least = AT_LEAST[model.explained > WELL]
-        usual = np.quantile(seconds, SOUND, method="lower")
-        still = stuck | (seconds > np.clip(USUALLY * usual, least, STILL))
-        if still.all() or (still == before).all():
-            break
-    if model.explained < LEAST_EXPLAINED and not still.all():
-        still = stuck  # the model cannot tell where it should move
+    kept, motion, model, still = without_still(recordings, each, j, rate, span)
     turned = opposite(recordings, j, rate)
     q_dot = np.concatenate([one.q_dot[:, j] for one in kept])
     steps = np.abs(np.diff(q))
@@ -150,7 +135,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         dead_zone=(model.zones[0], model.zones[1]),
         step=float(np.median(steps[steps > 0])) if steps.any() else 0.0,
         by_zones=best_lag(motion, np.array(zones)).explained if zones else 1.0,
-        still=[one.name for one in compress(recordings, still)],
+        still=still,
         opposite=[
             one.name
             for one, of in zip(recordings, each)
@@ -304,6 +289,32 @@ def reach(motion: Motion) -> Array:
     path = np.pad(np.cumsum(motion.velocity) / motion.rate, (second, 0))
     widest = np.ptp(sliding_window_view(path, second + 1), axis=1)
     return np.where(means(motion, motion.counts, 1.0) > 1 - 1e-9, widest, np.nan)
+
+
+def without_still(
+    recordings: list[Recording], each: list[Motion], j: int, rate: float, span: Pair
+) -> tuple[list[Recording], Motion, Model, list[str]]:
+    """Recordings in which joint `j` obeys, its motion in them, their model, and others' names.
+
+    `each` has the motion of each recording alone.
+    """
+    still = np.array([np.ptp(one.q[:, j]) <= MOVED for one in recordings])
+    held = [np.convolve(one.u[:, j], np.ones(round(rate)) / rate, "valid") for one in recordings]
+    stuck = still & [min(x.max(), -x.min()) > OPENS for x in held]  # a stop it would leave one way
+    for _ in range(4):  # again without those in which it stands still, until they are found
+        before = still
+        kept = [*compress(recordings, ~still | still.all())]
+        motion = motion_of(kept, j, rate, span)
+        model = fit_model(motion)
+        seconds = np.array([still_seconds(one, model, motion) for one in each])
+        least = AT_LEAST[model.explained > WELL]
+        usual = np.quantile(seconds, SOUND, method="lower")
+        still = stuck | (seconds > np.clip(USUALLY * usual, least, STILL))
+        if still.all() or (still == before).all():
+            break
+    if model.explained < LEAST_EXPLAINED and not still.all():
+        still = stuck  # the model cannot tell where it should move
+    return kept, motion, model, [one.name for one in compress(recordings, still)]
 
 
 def still_seconds(motion: Motion, model: Model, others: Motion) -> float:
