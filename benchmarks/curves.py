@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from matplotlib import pyplot as plt
 
 import benchmarks  # before NumPy computes: one thread
@@ -24,7 +23,7 @@ from brokk_min.actuator import ActuatorNet
 from brokk_min.cli.training import FIRST_STEPS
 from brokk_min.evaluation.baselines import BY_HAND, OPTIMISED, STRONGEST, read_gains
 from brokk_min.evaluation.rollout import title
-from brokk_min.learning.checkpoint import actor_weights, prepare
+from brokk_min.learning.checkpoint import actor_weights, prepare, quick_products
 from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.machine import BROKK_170 as M
@@ -35,9 +34,9 @@ GROWTH = 1.2  # of the steps between two points
 Curve = list[tuple[float, float, float]]  # steps, seconds of CPU, error [m/s]
 
 
+@quick_products()
 def learn(net: ActuatorNet, recipe: Recipe, total_steps: int, seed: int) -> Curve:
     """One training."""
-    torch.set_num_threads(1)
     recipe = replace(recipe, learner=replace(recipe.learner, total_steps=total_steps))
     env, advantages, start = prepare(M, net, recipe, seed)
     curve: Curve = []

@@ -33,7 +33,7 @@ from brokk_min.beyond.interface import INTERFACE
 from brokk_min.evaluation.baselines import read_gains
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
-from brokk_min.learning.checkpoint import Env, stagger_episodes
+from brokk_min.learning.checkpoint import Env, quick_products, stagger_episodes
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import Policy, load_policy
 from brokk_min.learning.recipes import find_recipe
@@ -224,9 +224,9 @@ class Clock:
 LEARNERS = {"groups": ours, "critic": ours, "sb3": sb3, "cleanrl": cleanrl}
 
 
+@quick_products()
 def run(name: str, settings: dict[str, Any], clock: Clock) -> None:
     """Train one learner until it has reached the target, or to the end."""
-    torch.set_num_threads(1)
     groups, options = name == "groups", clock.options
     recipe = find_recipe(critic=not groups)
     same = {"target_kl": PPOConfig.target_kl, "horizon": PPOConfig.horizon}

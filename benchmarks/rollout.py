@@ -15,7 +15,7 @@ import torch
 from benchmarks import POLICY
 from brokk_min import ppo
 from brokk_min.beyond.muon import Muon
-from brokk_min.learning.checkpoint import prepare
+from brokk_min.learning.checkpoint import prepare, quick_products
 from brokk_min.learning.policy import load_policy
 from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.machine import BROKK_170 as M
@@ -33,6 +33,7 @@ def seconds(call: Callable[[], object]) -> float:
     return float(np.median(times))
 
 
+@quick_products()
 def training(recipe: Recipe) -> list[float]:
     """Microseconds a step: environment, collection (which includes it), update."""
     net = load_policy(POLICY, M).net
@@ -62,7 +63,6 @@ def muon_step(ours: bool) -> float:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
     print(f"{'us a step':28} environment  collection  update")
     for name, paper in (("our agent", False), ("the paper's observation", True)):
         print(f"{name:28}" + "".join(f"{x:12.1f}" for x in training(find_recipe(paper))))

@@ -15,7 +15,9 @@ ensembles of models.
 It plugs into `actuator.ActuatorNet.outputs`; `identification.fitting` trains it.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,3 +32,9 @@ class NetEnsemble(ValveNet):
     def outputs(self, x: Array) -> Array:
         """The mean (n, batch) of what the K nets say of inputs (n, batch, I)."""
         return np.asarray(super().outputs(x[:, None]).mean(axis=1))
+
+
+def together(nets: Sequence[ValveNet], training: Mapping[str, Any]) -> NetEnsemble:
+    """The ensemble of nets that were fitted to one log from several seeds."""
+    weights = tuple(np.stack(of, axis=1) for of in zip(*(n.weights for n in nets), strict=True))
+    return NetEnsemble(**vars(nets[0]) | {"weights": weights, "training": training})

@@ -10,6 +10,7 @@ import numpy as np
 
 from brokk_min._files import digest, write_csv, write_json
 from brokk_min.actuator import PLANT, ActuatorNet, Plant, hydraulics_of
+from brokk_min.beyond.net_ensemble import together
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.evaluation import (
     adaptive,
@@ -100,6 +101,21 @@ def fit_net(chain: Chain, name: str, log: Log, recipe: Mapping[str, Any]) -> Act
     return net
 
 
+def fit_member(chain: Chain, log: Log, member: int) -> ActuatorNet:
+    """One net of each joint, of the five whose mean counts."""
+    config = fitting.OurFitConfig(chain.budget.fit_steps, members=1)
+    seed = fitting.OurFitConfig.members * chain.seed + member
+    return fitting.fit_nets(log, config, seed, chain.machine, chain.machine.name)
+
+
+def join_members(chain: Chain, *nets: Any) -> ActuatorNet:
+    """The nets that `fit_net` would have fitted one after the other, written to `net.npz`."""
+    config = fitting.OurFitConfig(chain.budget.fit_steps)
+    net = together(nets, {"seed": chain.seed, "settings": asdict(config)})
+    save_net(chain.out / "net.npz", net)
+    return net
+
+
 def recipe_of(name: str) -> Recipe:
     """The recipe of one of `POLICIES`."""
     return find_recipe(paper=name != "rl", critic=name == "rl_critic")
@@ -117,15 +133,21 @@ def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
 def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
     """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names."""
     tune = partial(baselines.tuned_baselines, chain.machine)
+    members = {
+        f"net {member}": partial(fit_member, chain, log, member)
+        for member in range(fitting.OurFitConfig.members)
+    }
     jobs: dict[str, Callable[..., Any]] = {
-        "net": partial(fit_net, chain, "net", log, {}),
+        **members,
+        "net": partial(join_members, chain),
         "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
         "rl_paper": partial(train_one, chain, "rl_paper"),  # the longest first
         "rl_critic": partial(train_one, chain, "rl_critic"),
         "rl": partial(train_one, chain, "rl"),
         "pids": partial(tune, effort=chain.budget.tuning, seed=chain.seed),
     }
-    needs = {name: ["net"] for name in (*POLICIES, "pids")} | {"rl_critic": ["net_paper"]}
+    needs = {name: ["net"] for name in (*POLICIES, "pids")}
+    needs |= {"net": [*members], "rl_critic": ["net_paper"]}
     return side_by_side(jobs, needs)
 
 

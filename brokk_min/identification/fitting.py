@@ -13,7 +13,7 @@ import numpy as np
 
 from brokk_min import fit as paper
 from brokk_min.actuator import ActuatorNet
-from brokk_min.beyond.net_ensemble import NetEnsemble
+from brokk_min.beyond.net_ensemble import together
 from brokk_min.beyond.valve_nets import ValveNet, valve_inputs
 from brokk_min.fit import FitConfig, Log, TrainingSet
 from brokk_min.machine import Array, Machine
@@ -75,11 +75,8 @@ def fit_nets(
     zones = machine.dead_zones[index].astype(np.float32)
     data = ValveTrainingSet(log, machine, zones) if config.valve else TrainingSet(log, machine)
     seeds = range(seed * config.members, (seed + 1) * config.members)
-    each = [fit_weights(data, config, one) for one in seeds]
-    net = data.nets(each[0], config, seed, name)
+    each = [data.nets(fit_weights(data, config, one), config, seed, name) for one in seeds]
     if not config.valve:
-        return net
-    if config.members == 1:
-        return ValveNet(**vars(net), dead_zones=zones)
-    weights = tuple(np.stack(of, axis=1) for of in zip(*each, strict=True))
-    return NetEnsemble(**vars(net) | {"weights": weights}, dead_zones=zones)
+        return each[0]
+    nets = [ValveNet(**vars(net), dead_zones=zones) for net in each]
+    return nets[0] if len(nets) == 1 else together(nets, nets[0].training)

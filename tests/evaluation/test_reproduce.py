@@ -18,6 +18,7 @@ from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget, variations
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import read_starts, task_sequences
+from brokk_min.identification.fitting import OurFitConfig, fit_nets
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import fingerprint, load_net
 from brokk_min.learning.policy import load_policy
@@ -88,6 +89,10 @@ def test_reproduce__writes_files_that_the_other_commands_read(folder, results):
     }
     interfaces = {name: "beyond" if name == "rl" else "paper" for name in policies}
     assert {name: policy.interface for name, policy in policies.items()} == interfaces
+    config = OurFitConfig(TINY.fit_steps)  # the members one after the other
+    in_turn = fit_nets(log, config, 3, COARSE, COARSE.name)
+    assert fingerprint(load_net(folder / "net.npz")) == fingerprint(in_turn)
+    assert load_net(folder / "net.npz").training == in_turn.training
     learned_on = {name: fingerprint(policy.net) for name, policy in policies.items()}
     ours, printed = (load_net(folder / f"{name}.npz", COARSE) for name in ("net", "net_paper"))
     assert learned_on.pop("rl_critic") == fingerprint(printed) != fingerprint(ours)

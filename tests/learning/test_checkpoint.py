@@ -13,7 +13,7 @@ from brokk_min.beyond.group_advantages import GroupVectorEnv, group_advantages
 from brokk_min.beyond.interface import INTERFACE
 from brokk_min.beyond.muon import Muon
 from brokk_min.env import PAPER, TaskConfig
-from brokk_min.learning.checkpoint import prepare, train_policy
+from brokk_min.learning.checkpoint import prepare, quick_products, train_policy
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import load_policy
 from brokk_min.learning.recipes import find_recipe
@@ -68,6 +68,15 @@ def test_prepare__begins_what_the_recipe_says(paper, critic):
     assert len(np.unique(state.ticks)) > 100 and state.ticks.max() > 0.95 * 400
     assert not state.ticks[state.lowest < 0].any()
     assert start.obs.shape == (256, len(task.interface.scale(BROKK_170)[0]))
+
+
+def test_quick_products__are_in_single_precision_and_end_with_the_training():
+    a, b = torch.randn(2, 300, 300)
+    with quick_products():
+        product = a @ b
+        assert torch.get_float32_matmul_precision() == "medium"
+    assert (product - a.double() @ b.double()).abs().max() < 1e-3  # bfloat16 is off by 0.1
+    assert torch.get_float32_matmul_precision() == "highest"
 
 
 @pytest.mark.parametrize("kind", ["ours", "paper"])
