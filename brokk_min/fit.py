@@ -273,12 +273,13 @@ class TrainingSet:
         def tensor(array: Array) -> Tensor:
             return torch.from_numpy(np.array(array, np.float32))
 
-        self.samples = tensor(signals.transpose(2, 0, 1))  # angle, velocity, command, (n, 3, N)
+        self.samples = tensor(signals.transpose(2, 1, 0))  # angle, velocity, command, (n, N, 3)
+        self.histories_from = self.samples.flatten(0, 1).unfold(0, H, 1)  # each sample, (nN, 3, H)
         self.target = tensor(self.joined.target.T)  # what nets should say there [rad/s], (n, N)
         self.q_low, self.q_high = (tensor(f(self.joined.q, axis=0)) for f in (np.min, np.max))
         self.input_mean, self.input_scale = tensor(mean), tensor(np.where(std > 1e-9, std, 1.0))
         self.output_low, self.output_high = tensor(low - margin), tensor(high + margin)  # (n,)
-        self.joint, self.window = torch.arange(len(targets)), torch.arange(1 - H, 1)
+        self.joint = torch.arange(len(targets))
 
     def read(self, signals: Array) -> Array:
         """What nets read of each sample, (N, n, 3) of angles, velocities, commands (3, N, n)."""
@@ -290,9 +291,8 @@ class TrainingSet:
 
     def histories(self, at: Tensor) -> Tensor:
         """Histories (batch, n, 3, H) whose newest samples are `at` (batch, n)."""
-        time = at[..., None] + self.window  # (batch, n, H)
-        windows = self.samples[self.joint[:, None], :, time]  # (batch, n, H, 3)
-        return windows.movedim(-1, -2)
+        oldest = at + 1 - self.machine.history
+        return self.histories_from[self.joint * self.samples.shape[1] + oldest]
 
     def nets(self, weights: Weights, config: FitConfig, seed: int, name: str) -> ActuatorNet:
         """Nets with these weights; what is kept beside them says how they were made."""

@@ -40,7 +40,7 @@ def mlp(inputs: int, outputs: int, std: float) -> nn.Sequential:
     """
     layers: list[nn.Module] = []
     for size_in, size_out in ((inputs, 256), (256, 128), (128, 64)):
-        layers += [layer_init(nn.Linear(size_in, size_out), math.sqrt(2)), nn.ELU()]
+        layers += [layer_init(nn.Linear(size_in, size_out), math.sqrt(2)), nn.ELU(inplace=True)]
     return nn.Sequential(*layers, layer_init(nn.Linear(64, outputs), std))
 
 

@@ -77,7 +77,7 @@ def accumulated_loss(data: TrainingSet, weights: list[Tensor], at: Tensor, ticks
         error = error + (velocity - target) / (data.output_high - data.output_low)
         loss = loss + error.square().mean(dim=0).sum() / ticks
         if k + 1 < ticks:
-            history = advance(data, history, velocity, data.samples[data.joint, 2, at + k + 1])
+            history = advance(data, history, velocity, data.samples[data.joint, at + k + 1, 2])
     return loss
 
 
