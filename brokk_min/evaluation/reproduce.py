@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,8 @@ from brokk_min.settings import TaskConfig
 
 # beyond the chain's: sixth in error of the seeds 0 to 9, of `rl_critic` third of 0 to 3
 SEEDS = {"rl": 8, "rl_paper": 5, "rl_critic": 3}
+PIDS = (baselines.RAW, baselines.BY_HAND, baselines.OPTIMISED, baselines.STRONGEST)
+CONTROLLERS = (*POLICIES, *PIDS)
 PAIRS = (  # of a policy and a PID, that the pages compare
     ("rl_critic", baselines.BY_HAND),
     ("rl_paper", baselines.BY_HAND),
@@ -76,12 +78,15 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     """
     chain = Chain(machine, out, budget, seed)
     out.mkdir(parents=True, exist_ok=True)
-    done = learn(chain, record_log(chain, RICH, "log"), record_log(chain, SINE, "log_paper"))
-    results, measured = measure_all(chain, done)
+    commands = sequences.task_sequences(machine)
+    starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
+    write_csv(out / "starts.csv", machine.names, starts.tolist())
+    rich, sines = record_log(chain, RICH, "log"), record_log(chain, SINE, "log_paper")
+    results, shown = summarise(chain, starts, do_all(chain, rich, sines, starts))
     write_json(out / "results.json", results)
     keys = ("meta", "table", "pairs", "claims")
     write_json(out / "table.json", {key: results[key] for key in keys})
-    report.write_report(out, machine, results, measured)
+    report.write_report(out, machine, results, shown)
     return results
 
 
@@ -130,8 +135,8 @@ def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     return train_policy(chain.machine, driven, recipe, seed, chain.out / POLICIES[name])
 
 
-def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
-    """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names."""
+def do_all(chain: Chain, log: Log, paper_log: Log, starts: Array) -> dict[str, Any]:
+    """All fits, trainings, tunings and measurements, side by side; what they give, by name."""
     tune = partial(baselines.tuned_baselines, chain.machine)
     members = {
         f"net {member}": partial(fit_member, chain, log, member)
@@ -145,29 +150,67 @@ def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
         "rl_critic": partial(train_one, chain, "rl_critic"),
         "rl": partial(train_one, chain, "rl"),
         "pids": partial(tune, effort=chain.budget.tuning, seed=chain.seed),
+        "tests": partial(try_plants, chain),
     }
-    needs = {name: ["net"] for name in (*POLICIES, "pids")}
+    needs = {name: ["net"] for name in (*POLICIES, "pids", "tests")}
     needs |= {"net": [*members], "rl_critic": ["net_paper"]}
+    ticks = round(chain.budget.short_s * chain.machine.rate)
+    axes = sequences.axis_sequences(chain.machine)
+    cases = unusual(chain.machine, [axis._replace(goals=axis.goals[:ticks]) for axis in axes])
+    for name in CONTROLLERS:
+        jobs[f"runs of {name}"] = partial(measure, chain, starts, cases, name)
+        needs[f"runs of {name}"] = ["net", name if name in POLICIES else "pids"]
     return side_by_side(jobs, needs)
 
 
-def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], report.Shown]:
-    """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
-    machine, budget, seed = chain.machine, chain.budget, chain.seed
-    net = select_nets(machine, done["net"])
-    controllers = {name: done[name] for name in POLICIES} | done["pids"]
+class Cases(NamedTuple):
+    """What controllers were not made for."""
+
+    drives: dict[str, tuple[Machine, Sequence[sequences.Commands], float]]  # machine, goals, noise
+    warm_up: list[tuple[Array, Array]]  # motions before the drives of those that are warm
+
+
+class Runs(NamedTuple):
+    """Of one controller."""
+
+    table: metrics.Table  # of all motions and starts
+    traces: metrics.Traces
+    varied: dict[str, metrics.Table]  # of `robustness`
+
+
+def measure(
+    chain: Chain, starts: Array, cases: Cases, name: str, net: ActuatorNet, found: Any
+) -> Runs:
+    """The runs of a policy, `found`, or of one of the PIDs that were found."""
+    machine, seed = chain.machine, chain.seed
+    controllers = {name: found if name in POLICIES else found[name]}
     commands = sequences.task_sequences(machine)
-    starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
-    write_csv(chain.out / "starts.csv", machine.names, starts.tolist())
-    ticks = round(budget.short_s * machine.rate)
-    short = [axis._replace(goals=axis.goals[:ticks]) for axis in commands[:3]]
-    varied = side_by_side(robustness(machine, controllers, net, short, starts[:16], seed))
-    plants: dict[str, Plant] = {"machine": PLANT, "nets": net}
+    table, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
+    net = select_nets(machine, net)
+    return Runs(table, traces, robustness(machine, controllers, net, cases, starts[:16], seed))
+
+
+def try_plants(chain: Chain, net: ActuatorNet) -> tuple[Any, preliminary.Gap, Any]:
+    """The paper's tests of machine and nets, their difference in task space, and verdicts."""
+    machine = chain.machine
+    plants: dict[str, Plant] = {"machine": PLANT, "nets": select_nets(machine, net)}
     tests = {kind: preliminary.preliminary_tests(machine, of) for kind, of in plants.items()}
-    gap = preliminary.sim_to_real(machine, plants, seed)
-    runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
+    gap = preliminary.sim_to_real(machine, plants, chain.seed)
+    return tests, gap, claims.net_claims(tests["nets"], gap)
+
+
+def summarise(
+    chain: Chain, starts: Array, done: Mapping[str, Any]
+) -> tuple[dict[str, Any], report.Shown]:
+    """What `results.json` has, and what the figures show. `done` is of `do_all`."""
+    machine, budget, seed = chain.machine, chain.budget, chain.seed
+    each: list[Runs] = [done[f"runs of {name}"] for name in CONTROLLERS]
+    runs = [run for one in each for run in one.table]
+    varied = {case: [run for one in each for run in one.varied[case]] for case in each[0].varied}
+    tests, gap, verdicts = done["tests"]
     along = metrics.means([run for run in runs if run["sequence"] in sequences.AXES])
-    meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, net)
+    meta = metrics.metadata(machine, seed)
+    meta |= baselines.gains_metadata(machine, select_nets(machine, done["net"]))
     meta |= {"effort": asdict(budget)}
     baselines.write_gains(chain.out / "gains.json", done["pids"], meta)
     files = [*POLICIES.values(), "gains.json"]
@@ -176,11 +219,12 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
         "table": {name: of["all"] for name, of in along.items()},
         "task_space": {"runs": runs, "means": metrics.means(runs)},
         "pairs": compare_pairs(runs),
-        "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
+        "claims": verdicts + claims.task_claims(runs),
         "trainings": trainings(budget, runs),
         "robustness": mean_errors(varied),
         "starts": starts.tolist(),
     }
+    traces = {key: trace for one in each for key, trace in one.traces.items()}
     return results, (tests, gap, traces)
 
 
@@ -230,35 +274,36 @@ def variations(machine: Machine) -> dict[str, Machine]:
     }
 
 
+def unusual(machine: Machine, commands: Sequence[sequences.Commands]) -> Cases:
+    """All `variations`, faster goals and other noise. Paper: Sec. 4.2"""
+    usual = TaskConfig.noise
+    drives = {name: (varied, commands, usual) for name, varied in variations(machine).items()}
+    faster = [one._replace(goals=1.5 * one.goals) for one in commands]
+    drives["goals +50 %"] = machine, faster, usual
+    drives["no sensor noise"] = machine, commands, 0.0
+    drives["twice the sensor noise"] = machine, commands, 2 * usual
+    longest = max(len(one.goals) for one in commands) * machine.dt
+    return Cases(drives, adaptive.warm_up_motions(machine, min(adaptive.SECONDS, longest)))
+
+
 def robustness(
     machine: Machine,
     controllers: metrics.Controllers,
     net: ActuatorNet,
-    commands: Sequence[sequences.Commands],
+    cases: Cases,
     starts: Array,
     seed: int,
-) -> dict[str, Callable[[], metrics.Table]]:
-    """Calls that drive each of the `variations`, faster goals, other noise. Paper: Sec. 4.2
-
-    Each controller is also there cold and warm, as it learns its valves by `beyond.adaptation`.
-    """
-    usual = TaskConfig.noise
-    cases = {name: (varied, commands, usual) for name, varied in variations(machine).items()}
-    faster = [one._replace(goals=1.5 * one.goals) for one in commands]
-    cases["goals +50 %"] = machine, faster, usual
-    cases["no sensor noise"] = machine, commands, 0.0
-    cases["twice the sensor noise"] = machine, commands, 2 * usual
-    rows, longest = len(commands) * len(starts), max(len(one.goals) for one in commands)
-    motions = adaptive.warm_up_motions(machine, min(adaptive.SECONDS, longest * machine.dt))
-
-    def score(varied: Machine, moves: Sequence[sequences.Commands], noise: float) -> metrics.Table:
+) -> dict[str, metrics.Table]:
+    """Runs of each case, also cold and warm, where a controller learns by `beyond.adaptation`."""
+    runs = {}
+    for name, (varied, commands, noise) in cases.drives.items():
+        rows = len(commands) * len(starts)
         learners = adaptive.cold_and_warm(
-            controllers, net, machine, varied, rows, motions, noise=noise
+            controllers, net, machine, varied, rows, cases.warm_up, noise=noise
         )
         every = {**controllers, **learners}
-        return metrics.evaluate(varied, every, moves, starts, seed, noise=noise)[0]
-
-    return {name: partial(score, *case) for name, case in cases.items()}
+        runs[name], _ = metrics.evaluate(varied, every, commands, starts, seed, noise=noise)
+    return runs
 
 
 def mean_errors(cases: Mapping[str, metrics.Table]) -> dict[str, dict[str, metrics.Mean]]:

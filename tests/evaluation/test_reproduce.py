@@ -144,8 +144,9 @@ def test_robustness__has_a_row_for_each_variation_and_controller(monkeypatch):
     net = obedient_net(BROKK_170)
     pid = pids(BROKK_170, net)["jacobian_pid_ff_integral"]
     task = {"idle": Idle(), "pid": pid}, short_axes(20, 2)[2:], np.tile(POSE, (2, 1)), 0
-    drives = reproduce.robustness(BROKK_170, task[0], net, *task[1:])
-    table = reproduce.mean_errors({case: drive() for case, drive in drives.items()})
+    cases = reproduce.unusual(BROKK_170, task[1])
+    runs = reproduce.robustness(BROKK_170, task[0], net, cases, *task[2:])
+    table = reproduce.mean_errors(runs)
     kinds = [f"{name}{start}" for start in ("", "+cold", "+warm") for name in ("idle", "pid")]
     assert sorted(table["nominal"]) == sorted(kinds)
     further = ["goals +50 %", "no sensor noise", "twice the sensor noise"]
