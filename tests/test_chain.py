@@ -18,6 +18,7 @@ SMALL = {"HOURS": "0.01", "FIT_STEPS": "8", "TRAIN_STEPS": "3072", "STARTS": "1"
 def test_chain__goes_from_a_recording_to_a_drive(tmp_path, monkeypatch):
     """The tool is to stand still; on a loaded computer the drive may stop, because it is late."""
     own_multicast_port(monkeypatch)
+    monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)  # other tests run all of it
     (tmp_path / "stand.csv").write_text("sequence,time,vx,vy,vz\nstand,0,0,0,0\nstand,1,0,0,0\n")
     command = tmp_path / "brokk-min"  # the package of this folder, whatever is installed
     command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m brokk_min "$@"\n')

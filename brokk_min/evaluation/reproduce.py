@@ -60,6 +60,15 @@ class Budget:
 QUICK = Budget(0.3, 1300, 400_000, (4, 8, 10.0), 4, 3.0)
 
 
+class Case(NamedTuple):
+    """What controllers were not made for."""
+
+    machine: Machine
+    commands: Sequence[sequences.Commands]
+    noise: float  # deviations
+    warm_up: list[tuple[Array, Array]]  # motions before the runs of those that are warm
+
+
 @dataclass(frozen=True)
 class Chain:
     """What all stages of one chain share."""
@@ -82,7 +91,11 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
     write_csv(out / "starts.csv", machine.names, starts.tolist())
     rich, sines = record_log(chain, RICH, "log"), record_log(chain, SINE, "log_paper")
-    results, shown = summarise(chain, starts, do_all(chain, rich, sines, starts))
+    ticks = round(budget.short_s * machine.rate)
+    short = [axis._replace(goals=axis.goals[:ticks]) for axis in sequences.axis_sequences(machine)]
+    cases = unusual(machine, short)
+    done = do_all(chain, rich, sines, starts, cases)
+    results, shown = summarise(chain, starts, cases, done)
     write_json(out / "results.json", results)
     keys = ("meta", "table", "pairs", "claims")
     write_json(out / "table.json", {key: results[key] for key in keys})
@@ -135,7 +148,9 @@ def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     return train_policy(chain.machine, driven, recipe, seed, chain.out / POLICIES[name])
 
 
-def do_all(chain: Chain, log: Log, paper_log: Log, starts: Array) -> dict[str, Any]:
+def do_all(
+    chain: Chain, log: Log, paper_log: Log, starts: Array, cases: Mapping[str, Case]
+) -> dict[str, Any]:
     """All fits, trainings, tunings and measurements, side by side; what they give, by name."""
     tune = partial(baselines.tuned_baselines, chain.machine)
     members = {
@@ -154,40 +169,37 @@ def do_all(chain: Chain, log: Log, paper_log: Log, starts: Array) -> dict[str, A
     }
     needs = {name: ["net"] for name in (*POLICIES, "pids", "tests")}
     needs |= {"net": [*members], "rl_critic": ["net_paper"]}
-    ticks = round(chain.budget.short_s * chain.machine.rate)
-    axes = sequences.axis_sequences(chain.machine)
-    cases = unusual(chain.machine, [axis._replace(goals=axis.goals[:ticks]) for axis in axes])
     for name in CONTROLLERS:
-        jobs[f"runs of {name}"] = partial(measure, chain, starts, cases, name)
-        needs[f"runs of {name}"] = ["net", name if name in POLICIES else "pids"]
+        jobs[f"runs of {name}"] = partial(measure, chain, starts, name)
+        for case, drives in cases.items():
+            jobs[f"{name}, {case}"] = partial(vary, chain, starts[:16], drives, name)
+        needs |= {
+            job: ["net", name if name in POLICIES else "pids"]
+            for job in (f"runs of {name}", *(f"{name}, {case}" for case in cases))
+        }
     return side_by_side(jobs, needs)
 
 
-class Cases(NamedTuple):
-    """What controllers were not made for."""
-
-    drives: dict[str, tuple[Machine, Sequence[sequences.Commands], float]]  # machine, goals, noise
-    warm_up: list[tuple[Array, Array]]  # motions before the drives of those that are warm
-
-
-class Runs(NamedTuple):
-    """Of one controller."""
-
-    table: metrics.Table  # of all motions and starts
-    traces: metrics.Traces
-    varied: dict[str, metrics.Table]  # of `robustness`
+def only(name: str, found: Any) -> metrics.Controllers:
+    """One controller by its name: a policy, `found`, or one of the PIDs that were found."""
+    return {name: found if name in POLICIES else found[name]}
 
 
 def measure(
-    chain: Chain, starts: Array, cases: Cases, name: str, net: ActuatorNet, found: Any
-) -> Runs:
-    """The runs of a policy, `found`, or of one of the PIDs that were found."""
-    machine, seed = chain.machine, chain.seed
-    controllers = {name: found if name in POLICIES else found[name]}
-    commands = sequences.task_sequences(machine)
-    table, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
+    chain: Chain, starts: Array, name: str, _: ActuatorNet, found: Any
+) -> tuple[metrics.Table, metrics.Traces]:
+    """Runs of one controller on the machine."""
+    commands = sequences.task_sequences(chain.machine)
+    return metrics.evaluate(chain.machine, only(name, found), commands, starts, chain.seed)
+
+
+def vary(
+    chain: Chain, starts: Array, case: Case, name: str, net: ActuatorNet, found: Any
+) -> metrics.Table:
+    """Runs of one controller in a `Case`, also as it learns its valves."""
+    machine = chain.machine
     net = select_nets(machine, net)
-    return Runs(table, traces, robustness(machine, controllers, net, cases, starts[:16], seed))
+    return robustness(machine, only(name, found), net, case, starts, chain.seed)
 
 
 def try_plants(chain: Chain, net: ActuatorNet) -> tuple[Any, preliminary.Gap, Any]:
@@ -200,13 +212,15 @@ def try_plants(chain: Chain, net: ActuatorNet) -> tuple[Any, preliminary.Gap, An
 
 
 def summarise(
-    chain: Chain, starts: Array, done: Mapping[str, Any]
+    chain: Chain, starts: Array, cases: Mapping[str, Case], done: Mapping[str, Any]
 ) -> tuple[dict[str, Any], report.Shown]:
     """What `results.json` has, and what the figures show. `done` is of `do_all`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
-    each: list[Runs] = [done[f"runs of {name}"] for name in CONTROLLERS]
-    runs = [run for one in each for run in one.table]
-    varied = {case: [run for one in each for run in one.varied[case]] for case in each[0].varied}
+    each = [done[f"runs of {name}"] for name in CONTROLLERS]
+    runs = [run for table, _ in each for run in table]
+    varied = {
+        case: [run for name in CONTROLLERS for run in done[f"{name}, {case}"]] for case in cases
+    }
     tests, gap, verdicts = done["tests"]
     along = metrics.means([run for run in runs if run["sequence"] in sequences.AXES])
     meta = metrics.metadata(machine, seed)
@@ -224,7 +238,7 @@ def summarise(
         "robustness": mean_errors(varied),
         "starts": starts.tolist(),
     }
-    traces = {key: trace for one in each for key, trace in one.traces.items()}
+    traces = {key: trace for _, of in each for key, trace in of.items()}
     return results, (tests, gap, traces)
 
 
@@ -274,36 +288,33 @@ def variations(machine: Machine) -> dict[str, Machine]:
     }
 
 
-def unusual(machine: Machine, commands: Sequence[sequences.Commands]) -> Cases:
+def unusual(machine: Machine, commands: Sequence[sequences.Commands]) -> dict[str, Case]:
     """All `variations`, faster goals and other noise. Paper: Sec. 4.2"""
-    usual = TaskConfig.noise
-    drives = {name: (varied, commands, usual) for name, varied in variations(machine).items()}
-    faster = [one._replace(goals=1.5 * one.goals) for one in commands]
-    drives["goals +50 %"] = machine, faster, usual
-    drives["no sensor noise"] = machine, commands, 0.0
-    drives["twice the sensor noise"] = machine, commands, 2 * usual
     longest = max(len(one.goals) for one in commands) * machine.dt
-    return Cases(drives, adaptive.warm_up_motions(machine, min(adaptive.SECONDS, longest)))
+    warm_up = adaptive.warm_up_motions(machine, min(adaptive.SECONDS, longest))
+    usual = Case(machine, commands, TaskConfig.noise, warm_up)
+    cases = {name: usual._replace(machine=one) for name, one in variations(machine).items()}
+    faster = [one._replace(goals=1.5 * one.goals) for one in commands]
+    cases["goals +50 %"] = usual._replace(commands=faster)
+    cases["no sensor noise"] = usual._replace(noise=0.0)
+    cases["twice the sensor noise"] = usual._replace(noise=2 * usual.noise)
+    return cases
 
 
 def robustness(
     machine: Machine,
     controllers: metrics.Controllers,
     net: ActuatorNet,
-    cases: Cases,
+    case: Case,
     starts: Array,
     seed: int,
-) -> dict[str, metrics.Table]:
-    """Runs of each case, also cold and warm, where a controller learns by `beyond.adaptation`."""
-    runs = {}
-    for name, (varied, commands, noise) in cases.drives.items():
-        rows = len(commands) * len(starts)
-        learners = adaptive.cold_and_warm(
-            controllers, net, machine, varied, rows, cases.warm_up, noise=noise
-        )
-        every = {**controllers, **learners}
-        runs[name], _ = metrics.evaluate(varied, every, commands, starts, seed, noise=noise)
-    return runs
+) -> metrics.Table:
+    """Runs in a case, also cold and warm, where a controller learns by `beyond.adaptation`."""
+    truth, commands, noise, warm_up = case
+    rows = len(commands) * len(starts)
+    learners = adaptive.cold_and_warm(controllers, net, machine, truth, rows, warm_up, noise=noise)
+    every = {**controllers, **learners}
+    return metrics.evaluate(truth, every, commands, starts, seed, noise=noise)[0]
 
 
 def mean_errors(cases: Mapping[str, metrics.Table]) -> dict[str, dict[str, metrics.Mean]]:

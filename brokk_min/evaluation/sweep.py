@@ -95,7 +95,10 @@ def vary(
         controllers: dict[str, Controller] = {**read_gains(file, machine, net)}
     else:
         controllers = {"rl" if name.startswith("seed") else name: load_policy(file, machine)}
-    return robustness(machine, controllers, net, unusual(machine, sequences), poses, 0)
+    return {
+        case: robustness(machine, controllers, net, drives, poses, 0)
+        for case, drives in unusual(machine, sequences).items()
+    }
 
 
 def pool(

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -15,7 +16,7 @@ from brokk_min.actuator import cylinder_speeds, hydraulics_of
 from brokk_min.evaluation import adaptive, baselines, metrics, report, reproduce
 from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.claims import TEXTS
-from brokk_min.evaluation.reproduce import Budget, variations
+from brokk_min.evaluation.reproduce import Budget, unusual, variations
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import read_starts, task_sequences
 from brokk_min.identification.fitting import OurFitConfig, fit_nets
@@ -40,10 +41,14 @@ def coarse_png(figure):
 @pytest.fixture(scope="module", autouse=True)
 def short_robustness():
     """Few drives warm up, and the chain measures robustness on the machine itself alone."""
+
+    def nominal(machine, commands):
+        return {"nominal": unusual(machine, commands)["nominal"]}
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(adaptive, "DRIVES", 2)
         patch.setattr(adaptive, "PARTS", 1)
-        patch.setattr(reproduce, "variations", lambda machine: {"nominal": machine})
+        patch.setattr(reproduce, "unusual", nominal)
         yield
 
 
@@ -67,6 +72,7 @@ def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, 
     """The second time by its command, as `--quick`, in several processes."""
     monkeypatch.setattr(reproduce, "QUICK", TINY)
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
+    monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)  # the first time counts
     (tmp_path / "m.py").write_text(
         "from dataclasses import replace\nfrom brokk_min.actuator import hydraulics_of\n"
         "from brokk_min.machine import BROKK_170\n"
@@ -139,14 +145,13 @@ def test_variations__change_what_they_say():
         np.testing.assert_allclose(result[name].dead_zones, np.full((5, 2), zone))
 
 
-def test_robustness__has_a_row_for_each_variation_and_controller(monkeypatch):
-    monkeypatch.setattr(reproduce, "variations", variations)
+def test_robustness__has_a_row_for_each_variation_and_controller():
     net = obedient_net(BROKK_170)
     pid = pids(BROKK_170, net)["jacobian_pid_ff_integral"]
     task = {"idle": Idle(), "pid": pid}, short_axes(20, 2)[2:], np.tile(POSE, (2, 1)), 0
-    cases = reproduce.unusual(BROKK_170, task[1])
-    runs = reproduce.robustness(BROKK_170, task[0], net, cases, *task[2:])
-    table = reproduce.mean_errors(runs)
+    cases = unusual(BROKK_170, task[1])
+    score = partial(reproduce.robustness, BROKK_170, task[0], net)
+    table = reproduce.mean_errors({case: score(of, *task[2:]) for case, of in cases.items()})
     kinds = [f"{name}{start}" for start in ("", "+cold", "+warm") for name in ("idle", "pid")]
     assert sorted(table["nominal"]) == sorted(kinds)
     further = ["goals +50 %", "no sensor noise", "twice the sensor noise"]

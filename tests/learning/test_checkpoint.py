@@ -74,7 +74,6 @@ def test_quick_products__are_in_single_precision_and_end_with_the_training():
     a, b = torch.randn(2, 300, 300)
     with quick_products():
         product = a @ b
-        assert torch.get_float32_matmul_precision() == "medium"
     assert (product - a.double() @ b.double()).abs().max() < 1e-3  # bfloat16 is off by 0.1
     assert torch.get_float32_matmul_precision() == "highest"
 
