@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,8 +34,6 @@ from brokk_min.settings import TaskConfig
 
 # beyond the chain's: sixth in error of the seeds 0 to 9, of `rl_critic` third of 0 to 3
 SEEDS = {"rl": 8, "rl_paper": 5, "rl_critic": 3}
-PIDS = (baselines.RAW, baselines.BY_HAND, baselines.OPTIMISED, baselines.STRONGEST)
-CONTROLLERS = (*POLICIES, *PIDS)
 PAIRS = (  # of a policy and a PID, that the pages compare
     ("rl_critic", baselines.BY_HAND),
     ("rl_paper", baselines.BY_HAND),
@@ -60,15 +58,6 @@ class Budget:
 QUICK = Budget(0.3, 1300, 400_000, (4, 8, 10.0), 4, 3.0)
 
 
-class Case(NamedTuple):
-    """What controllers were not made for."""
-
-    machine: Machine
-    commands: Sequence[sequences.Commands]
-    noise: float  # deviations
-    warm_up: list[tuple[Array, Array]]  # motions before the runs of those that are warm
-
-
 @dataclass(frozen=True)
 class Chain:
     """What all stages of one chain share."""
@@ -87,19 +76,12 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     """
     chain = Chain(machine, out, budget, seed)
     out.mkdir(parents=True, exist_ok=True)
-    commands = sequences.task_sequences(machine)
-    starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
-    write_csv(out / "starts.csv", machine.names, starts.tolist())
-    rich, sines = record_log(chain, RICH, "log"), record_log(chain, SINE, "log_paper")
-    ticks = round(budget.short_s * machine.rate)
-    short = [axis._replace(goals=axis.goals[:ticks]) for axis in sequences.axis_sequences(machine)]
-    cases = unusual(machine, short)
-    done = do_all(chain, rich, sines, starts, cases)
-    results, shown = summarise(chain, starts, cases, done)
+    done = learn(chain, record_log(chain, RICH, "log"), record_log(chain, SINE, "log_paper"))
+    results, measured = measure_all(chain, done)
     write_json(out / "results.json", results)
     keys = ("meta", "table", "pairs", "claims")
     write_json(out / "table.json", {key: results[key] for key in keys})
-    report.write_report(out, machine, results, shown)
+    report.write_report(out, machine, results, measured)
     return results
 
 
@@ -148,10 +130,8 @@ def train_one(chain: Chain, name: str, net: ActuatorNet) -> Policy:
     return train_policy(chain.machine, driven, recipe, seed, chain.out / POLICIES[name])
 
 
-def do_all(
-    chain: Chain, log: Log, paper_log: Log, starts: Array, cases: Mapping[str, Case]
-) -> dict[str, Any]:
-    """All fits, trainings, tunings and measurements, side by side; what they give, by name."""
+def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
+    """All fits, trainings and tunings, side by side; nets, policies and PIDs by their names."""
     tune = partial(baselines.tuned_baselines, chain.machine)
     members = {
         f"net {member}": partial(fit_member, chain, log, member)
@@ -165,66 +145,29 @@ def do_all(
         "rl_critic": partial(train_one, chain, "rl_critic"),
         "rl": partial(train_one, chain, "rl"),
         "pids": partial(tune, effort=chain.budget.tuning, seed=chain.seed),
-        "tests": partial(try_plants, chain),
     }
-    needs = {name: ["net"] for name in (*POLICIES, "pids", "tests")}
+    needs = {name: ["net"] for name in (*POLICIES, "pids")}
     needs |= {"net": [*members], "rl_critic": ["net_paper"]}
-    for name in CONTROLLERS:
-        jobs[f"runs of {name}"] = partial(measure, chain, starts, name)
-        for case, drives in cases.items():
-            jobs[f"{name}, {case}"] = partial(vary, chain, starts[:16], drives, name)
-        needs |= {
-            job: ["net", name if name in POLICIES else "pids"]
-            for job in (f"runs of {name}", *(f"{name}, {case}" for case in cases))
-        }
     return side_by_side(jobs, needs)
 
 
-def only(name: str, found: Any) -> metrics.Controllers:
-    """One controller by its name: a policy, `found`, or one of the PIDs that were found."""
-    return {name: found if name in POLICIES else found[name]}
-
-
-def measure(
-    chain: Chain, starts: Array, name: str, _: ActuatorNet, found: Any
-) -> tuple[metrics.Table, metrics.Traces]:
-    """Runs of one controller on the machine."""
-    commands = sequences.task_sequences(chain.machine)
-    return metrics.evaluate(chain.machine, only(name, found), commands, starts, chain.seed)
-
-
-def vary(
-    chain: Chain, starts: Array, case: Case, name: str, net: ActuatorNet, found: Any
-) -> metrics.Table:
-    """Runs of one controller in a `Case`, also as it learns its valves."""
-    machine = chain.machine
-    net = select_nets(machine, net)
-    return robustness(machine, only(name, found), net, case, starts, chain.seed)
-
-
-def try_plants(chain: Chain, net: ActuatorNet) -> tuple[Any, preliminary.Gap, Any]:
-    """The paper's tests of machine and nets, their difference in task space, and verdicts."""
-    machine = chain.machine
-    plants: dict[str, Plant] = {"machine": PLANT, "nets": select_nets(machine, net)}
-    tests = {kind: preliminary.preliminary_tests(machine, of) for kind, of in plants.items()}
-    gap = preliminary.sim_to_real(machine, plants, chain.seed)
-    return tests, gap, claims.net_claims(tests["nets"], gap)
-
-
-def summarise(
-    chain: Chain, starts: Array, cases: Mapping[str, Case], done: Mapping[str, Any]
-) -> tuple[dict[str, Any], report.Shown]:
-    """What `results.json` has, and what the figures show. `done` is of `do_all`."""
+def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], report.Shown]:
+    """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
-    each = [done[f"runs of {name}"] for name in CONTROLLERS]
-    runs = [run for table, _ in each for run in table]
-    varied = {
-        case: [run for name in CONTROLLERS for run in done[f"{name}, {case}"]] for case in cases
-    }
-    tests, gap, verdicts = done["tests"]
+    net = select_nets(machine, done["net"])
+    controllers = {name: done[name] for name in POLICIES} | done["pids"]
+    commands = sequences.task_sequences(machine)
+    starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
+    write_csv(chain.out / "starts.csv", machine.names, starts.tolist())
+    ticks = round(budget.short_s * machine.rate)
+    short = [axis._replace(goals=axis.goals[:ticks]) for axis in commands[:3]]
+    varied = side_by_side(robustness(machine, controllers, net, short, starts[:16], seed))
+    plants: dict[str, Plant] = {"machine": PLANT, "nets": net}
+    tests = {kind: preliminary.preliminary_tests(machine, of) for kind, of in plants.items()}
+    gap = preliminary.sim_to_real(machine, plants, seed)
+    runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
     along = metrics.means([run for run in runs if run["sequence"] in sequences.AXES])
-    meta = metrics.metadata(machine, seed)
-    meta |= baselines.gains_metadata(machine, select_nets(machine, done["net"]))
+    meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, net)
     meta |= {"effort": asdict(budget)}
     baselines.write_gains(chain.out / "gains.json", done["pids"], meta)
     files = [*POLICIES.values(), "gains.json"]
@@ -233,12 +176,11 @@ def summarise(
         "table": {name: of["all"] for name, of in along.items()},
         "task_space": {"runs": runs, "means": metrics.means(runs)},
         "pairs": compare_pairs(runs),
-        "claims": verdicts + claims.task_claims(runs),
+        "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
         "trainings": trainings(budget, runs),
         "robustness": mean_errors(varied),
         "starts": starts.tolist(),
     }
-    traces = {key: trace for _, of in each for key, trace in of.items()}
     return results, (tests, gap, traces)
 
 
@@ -288,33 +230,35 @@ def variations(machine: Machine) -> dict[str, Machine]:
     }
 
 
-def unusual(machine: Machine, commands: Sequence[sequences.Commands]) -> dict[str, Case]:
-    """All `variations`, faster goals and other noise. Paper: Sec. 4.2"""
-    longest = max(len(one.goals) for one in commands) * machine.dt
-    warm_up = adaptive.warm_up_motions(machine, min(adaptive.SECONDS, longest))
-    usual = Case(machine, commands, TaskConfig.noise, warm_up)
-    cases = {name: usual._replace(machine=one) for name, one in variations(machine).items()}
-    faster = [one._replace(goals=1.5 * one.goals) for one in commands]
-    cases["goals +50 %"] = usual._replace(commands=faster)
-    cases["no sensor noise"] = usual._replace(noise=0.0)
-    cases["twice the sensor noise"] = usual._replace(noise=2 * usual.noise)
-    return cases
-
-
 def robustness(
     machine: Machine,
     controllers: metrics.Controllers,
     net: ActuatorNet,
-    case: Case,
+    commands: Sequence[sequences.Commands],
     starts: Array,
     seed: int,
-) -> metrics.Table:
-    """Runs in a case, also cold and warm, where a controller learns by `beyond.adaptation`."""
-    truth, commands, noise, warm_up = case
-    rows = len(commands) * len(starts)
-    learners = adaptive.cold_and_warm(controllers, net, machine, truth, rows, warm_up, noise=noise)
-    every = {**controllers, **learners}
-    return metrics.evaluate(truth, every, commands, starts, seed, noise=noise)[0]
+) -> dict[str, Callable[[], metrics.Table]]:
+    """Calls that drive each of the `variations`, faster goals, other noise. Paper: Sec. 4.2
+
+    Each controller is also there cold and warm, as it learns its valves by `beyond.adaptation`.
+    """
+    usual = TaskConfig.noise
+    cases = {name: (varied, commands, usual) for name, varied in variations(machine).items()}
+    faster = [one._replace(goals=1.5 * one.goals) for one in commands]
+    cases["goals +50 %"] = machine, faster, usual
+    cases["no sensor noise"] = machine, commands, 0.0
+    cases["twice the sensor noise"] = machine, commands, 2 * usual
+    rows, longest = len(commands) * len(starts), max(len(one.goals) for one in commands)
+    motions = adaptive.warm_up_motions(machine, min(adaptive.SECONDS, longest * machine.dt))
+
+    def score(varied: Machine, moves: Sequence[sequences.Commands], noise: float) -> metrics.Table:
+        learners = adaptive.cold_and_warm(
+            controllers, net, machine, varied, rows, motions, noise=noise
+        )
+        every = {**controllers, **learners}
+        return metrics.evaluate(varied, every, moves, starts, seed, noise=noise)[0]
+
+    return {name: partial(score, *case) for name, case in cases.items()}
 
 
 def mean_errors(cases: Mapping[str, metrics.Table]) -> dict[str, dict[str, metrics.Mean]]:

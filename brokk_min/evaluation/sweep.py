@@ -9,7 +9,7 @@ from brokk_min._files import digest, expect_same, write_json
 from brokk_min.actuator import ActuatorNet
 from brokk_min.evaluation.baselines import read_gains
 from brokk_min.evaluation.metrics import Mean, Table, evaluate, means, metadata
-from brokk_min.evaluation.reproduce import mean_errors, robustness, unusual
+from brokk_min.evaluation.reproduce import mean_errors, robustness
 from brokk_min.evaluation.sequences import AXES, axis_sequences, evaluation_starts, task_sequences
 from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.checkpoint import train_policy
@@ -95,10 +95,8 @@ def vary(
         controllers: dict[str, Controller] = {**read_gains(file, machine, net)}
     else:
         controllers = {"rl" if name.startswith("seed") else name: load_policy(file, machine)}
-    return {
-        case: robustness(machine, controllers, net, drives, poses, 0)
-        for case, drives in unusual(machine, sequences).items()
-    }
+    drives = robustness(machine, controllers, net, sequences, poses, 0)
+    return {case: drive() for case, drive in drives.items()}
 
 
 def pool(

@@ -38,9 +38,9 @@ Env = VectorEnv[Any, Any, Any]  # a `TaskVectorEnv`, or groups in one
 def quick_products() -> Iterator[None]:
     """Matrix products by oneDNN, on one thread, because several wait in vain on busy cores.
 
-    MKL, torch's first choice, uses AVX-512 on Intel's processors alone; on AMD's oneDNN is 2.3
-    times as quick. Only "medium" lets torch choose it. That would also allow bfloat16 on AMX, which
-    is therefore hidden: products stay in single precision.
+    MKL, torch's first choice, uses AVX-512 on Intel's processors alone, and oneDNN on AMD's, too.
+    Only "medium" lets torch choose it. That would also allow bfloat16 on AMX, which is therefore
+    hidden: products stay in single precision.
     """
     torch.set_num_threads(1)
     os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_BF16")  # read at the first product

@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from functools import partial
 from itertools import product
 
 import numpy as np
@@ -16,7 +15,7 @@ from brokk_min.actuator import cylinder_speeds, hydraulics_of
 from brokk_min.evaluation import adaptive, baselines, metrics, report, reproduce
 from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.claims import TEXTS
-from brokk_min.evaluation.reproduce import Budget, unusual, variations
+from brokk_min.evaluation.reproduce import Budget, robustness, variations
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.evaluation.sequences import read_starts, task_sequences
 from brokk_min.identification.fitting import OurFitConfig, fit_nets
@@ -42,13 +41,13 @@ def coarse_png(figure):
 def short_robustness():
     """Few drives warm up, and the chain measures robustness on the machine itself alone."""
 
-    def nominal(machine, commands):
-        return {"nominal": unusual(machine, commands)["nominal"]}
+    def nominal(*task):
+        return {"nominal": robustness(*task)["nominal"]}
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(adaptive, "DRIVES", 2)
         patch.setattr(adaptive, "PARTS", 1)
-        patch.setattr(reproduce, "unusual", nominal)
+        patch.setattr(reproduce, "robustness", nominal)
         yield
 
 
@@ -149,9 +148,8 @@ def test_robustness__has_a_row_for_each_variation_and_controller():
     net = obedient_net(BROKK_170)
     pid = pids(BROKK_170, net)["jacobian_pid_ff_integral"]
     task = {"idle": Idle(), "pid": pid}, short_axes(20, 2)[2:], np.tile(POSE, (2, 1)), 0
-    cases = unusual(BROKK_170, task[1])
-    score = partial(reproduce.robustness, BROKK_170, task[0], net)
-    table = reproduce.mean_errors({case: score(of, *task[2:]) for case, of in cases.items()})
+    drives = robustness(BROKK_170, task[0], net, *task[1:])
+    table = reproduce.mean_errors({case: drive() for case, drive in drives.items()})
     kinds = [f"{name}{start}" for start in ("", "+cold", "+warm") for name in ("idle", "pid")]
     assert sorted(table["nominal"]) == sorted(kinds)
     further = ["goals +50 %", "no sensor noise", "twice the sensor noise"]
