@@ -6,7 +6,7 @@ import numpy as np
 
 from brokk_min.actuator import PLANT, ActuatorNet, Plant
 from brokk_min.beyond.adaptation import Adaptive, Known
-from brokk_min.evaluation.rollout import rollout
+from brokk_min.evaluation.rollout import Together, rollout
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.machine import Array, Controller, Machine
 from brokk_min.settings import TaskConfig
@@ -37,14 +37,15 @@ def cold_and_warm(
 
     `rows` runs are to come; each begins with what one of the drives has learned.
     """
+    many, learner = len(controllers), Adaptive(Together([*controllers.values()]), net, machine)
+    for part, motion in enumerate(motions):  # of all controllers as one batch
+        rng = np.random.default_rng(SEED + part)
+        rollout(truth, learner, *motion, noise, rng, plant, many)
+    assert learner.known is not None  # it has driven
+    known = zip(*(np.split(of, many) for of in learner.known), strict=True)
     result: dict[str, Controller] = {}
-    for name, controller in controllers.items():
+    for (name, controller), learned in zip(controllers.items(), known, strict=True):
+        each = Known(*(np.resize(of, (rows, *of.shape[1:])) for of in learned))
         result[f"{name}+cold"] = Adaptive(controller, net, machine)
-        warm = Adaptive(controller, net, machine)
-        for part, motion in enumerate(motions):
-            rng = np.random.default_rng(SEED + part)
-            rollout(truth, warm, *motion, noise, rng, plant)
-        assert warm.known is not None  # it has driven
-        warm.known = Known(*(np.resize(of, (rows, *of.shape[1:])) for of in warm.known))
-        result[f"{name}+warm"] = warm
+        result[f"{name}+warm"] = Adaptive(controller, net, machine, each)
     return result

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from tqdm import tqdm
 from brokk_min._files import made_with
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import reward
-from brokk_min.evaluation.rollout import Trace, rollout
+from brokk_min.evaluation.rollout import Together, Trace, rollout
 from brokk_min.evaluation.sequences import Commands
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import Array, Controller, Machine
@@ -121,22 +122,22 @@ def evaluate(
     goals = {s.name: s.for_starts(machine, starts) for s in sequences}  # all are one batch
     ticks = max(len(of) for of in goals.values())
     padded = [np.pad(of, ((0, ticks - len(of)), (0, 0), (0, 0))) for of in goals.values()]
-    q, batch = np.tile(starts, (len(goals), 1)), np.concatenate(padded, axis=1)
+    q, each_tick = np.tile(starts, (len(goals), 1)), np.concatenate(padded, axis=1)
+    together, rng = Together([*controllers.values()]), np.random.default_rng(seed)
+    batch = tqdm(each_tick, "evaluate", unit="tick", disable=None)
+    every = rollout(machine, together, q, batch, noise, rng, plant, len(controllers))
     rows: Table = []
     traces: dict[tuple[str, str], Trace] = {}
-    for name, controller in tqdm(controllers.items(), "evaluate", unit="controller", disable=None):
-        rng = np.random.default_rng(seed)
-        every = rollout(machine, controller, q, batch, noise, rng, plant)
-        for i, (sequence, goal) in enumerate(goals.items()):
-            part = slice(i * len(starts), (i + 1) * len(starts))
-            trace = Trace(*(array[: len(goal), part] for array in every))
-            columns = metrics(machine, trace, goal, p_start)
-            for start in range(len(starts)):
-                labels = {"controller": name, "sequence": sequence, "start": start}
-                row = {key: float(of[start]) for key, of in columns.items()}
-                figures = {key: None if np.isnan(x) else x for key, x in row.items()}
-                rows.append(labels | {"kind": "workspace"} | figures)
-            traces[name, sequence] = trace
+    for i, (name, (sequence, goal)) in enumerate(product(controllers, goals.items())):
+        part = slice(i * len(starts), (i + 1) * len(starts))
+        trace = Trace(*(array[: len(goal), part] for array in every))
+        columns = metrics(machine, trace, goal, p_start)
+        for start in range(len(starts)):
+            labels = {"controller": name, "sequence": sequence, "start": start}
+            row = {key: float(of[start]) for key, of in columns.items()}
+            figures = {key: None if np.isnan(x) else x for key, x in row.items()}
+            rows.append(labels | {"kind": "workspace"} | figures)
+        traces[name, sequence] = trace
     return rows, traces
 
 

@@ -161,11 +161,13 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
     write_csv(chain.out / "starts.csv", machine.names, starts.tolist())
     ticks = round(budget.short_s * machine.rate)
     short = [axis._replace(goals=axis.goals[:ticks]) for axis in commands[:3]]
-    varied = side_by_side(robustness(machine, controllers, net, short, starts[:16], seed))
     plants: dict[str, Plant] = {"machine": PLANT, "nets": net}
+    varied = robustness(machine, controllers, net, short, starts[:16], seed)
+    drive = partial(metrics.evaluate, machine, controllers, commands, starts, seed)
+    driven = side_by_side({"runs": drive, **varied})
+    runs, traces = driven["runs"]
     tests = {kind: preliminary.preliminary_tests(machine, of) for kind, of in plants.items()}
     gap = preliminary.sim_to_real(machine, plants, seed)
-    runs, traces = metrics.evaluate(machine, controllers, commands, starts, seed)
     along = metrics.means([run for run in runs if run["sequence"] in sequences.AXES])
     meta = metrics.metadata(machine, seed) | baselines.gains_metadata(machine, net)
     meta |= {"effort": asdict(budget)}
@@ -178,7 +180,7 @@ def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], 
         "pairs": compare_pairs(runs),
         "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
         "trainings": trainings(budget, runs),
-        "robustness": mean_errors(varied),
+        "robustness": mean_errors({case: driven[case] for case in varied}),
         "starts": starts.tolist(),
     }
     return results, (tests, gap, traces)

@@ -1,6 +1,8 @@
-"""A controller follows given tool velocities, on the analytic plant or on any other one."""
+"""Controllers follow given tool velocities, on the analytic plant or on any other one."""
 
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,7 +10,7 @@ from numpy.typing import ArrayLike
 from brokk_min.actuator import PLANT, Plant
 from brokk_min.env import draw_noise, initial_state, measure, transition
 from brokk_min.kinematics import forward_kinematics, tool_position, tool_velocity
-from brokk_min.machine import Array, Controller, Machine
+from brokk_min.machine import Array, Controller, Machine, Measured
 from brokk_min.settings import TaskConfig
 
 TITLES = {  # of controllers in tables, figures and windows, by their names in files
@@ -48,26 +50,50 @@ class Trace(NamedTuple):
     v_tool: Array  # true tool velocity [m/s], 3
 
 
+@dataclass(frozen=True)
+class Together:
+    """Controllers that drive equal parts of a batch, one after the other; itself a `Controller`."""
+
+    controllers: Sequence[Controller]
+
+    def start(self, num: int) -> list[Any]:
+        """The states of all."""
+        return [one.start(num // len(self.controllers)) for one in self.controllers]
+
+    def __call__(self, measured: Measured, states: list[Any]) -> tuple[Array, list[Any]]:
+        """The commands of all, below each other, and their states."""
+        parts = zip(*(np.split(array, len(states)) for array in measured), strict=True)
+        each = zip(self.controllers, parts, states, strict=True)
+        done = [controller(Measured(*part), state) for controller, part, state in each]
+        return np.concatenate([u for u, _ in done]), [state for _, state in done]
+
+
 def rollout(
     machine: Machine,
     controller: Controller,
     start: ArrayLike,
-    goals: Array,
+    goals: Iterable[Array],
     noise: float,
     rng: np.random.Generator,
     plant: Plant = PLANT,
+    copies: int = 1,
 ) -> Trace:
     """Let one controller follow given goals from rest. Paper: Fig. 3
 
     `start` are angles [rad] (num, n), `goals` tool velocities during each tick [m/s] (T, num, 3),
-    `noise` the largest of the sensors [deviations]. No episode ends.
+    `noise` the largest of the sensors [deviations]. No episode ends. All this is there in so many
+    `copies`, below each other in one batch.
     """
-    state = initial_state(machine, start, goals[0], plant)
-    controller_state, config = controller.start(len(state.q)), TaskConfig(noise=noise)
+
+    def copied(rows: ArrayLike) -> Array:
+        return np.tile(rows, (copies, 1))
+
+    state, num = initial_state(machine, copied(start), np.zeros(3), plant), len(np.asarray(start))
+    controller_state, config = controller.start(copies * num), TaskConfig(noise=noise)
     ticks = []
     for goal in goals:
-        v_goal = np.broadcast_to(goal.astype(np.float32), state.v_goal.shape)
-        error = draw_noise(machine, config, rng, len(state.q))
+        v_goal = copied(np.broadcast_to(goal.astype(np.float32), (num, 3)))
+        error = copied(draw_noise(machine, config, rng, num))
         measured = measure(machine, state.history, v_goal, error)
         u, controller_state = controller(measured, controller_state)
         state = transition(machine, plant, state._replace(v_goal=v_goal), u)

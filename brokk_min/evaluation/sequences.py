@@ -138,7 +138,7 @@ def draw_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed:
     rng = np.random.default_rng(seed)
 
     def draw() -> Array:
-        poses = draw_pose(machine, TUNING, rng, POSES).round(4)
+        poses = draw_pose(machine, TUNING, rng, 10 * POSES).round(4)
         poses = np.clip(poses, machine.column("q_min"), machine.column("q_max"))
         for sequence in sequences:
             poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]
@@ -153,9 +153,9 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     They answer at once, and are as fast as the analytic plant's cylinders at the command limit.
     The margins to the path, the ground, the joints' ranges and their speeds are assumed.
     """
+    rows = np.arange(len(start))  # those that could follow so far
     q, q_dot = np.array(start, float), np.zeros((len(start), machine.n))
     p_goal = tool_position(forward_kinematics(machine, q))
-    result = np.ones(len(q), bool)
     low, high = machine.column("q_min") + 0.05, machine.column("q_max") - 0.05
     limit = machine.pwm_limit / PWM_MAX * np.array([[1.0], [-1.0]])
     opening = valve_opening(limit, machine.dead_zones)  # up, and down, which is negative
@@ -163,18 +163,19 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     for v_goal in goals:
         frames = forward_kinematics(machine, q)
         off = p_goal - tool_position(frames)
+        fits = np.linalg.norm(off, axis=-1) < 0.02
+        fits &= lowest_point(frames) > machine.ground + 0.1
         J = jacobian(frames)[..., machine.driven]
         J_inv = dls(J, limit_weights(machine, q, q_dot)[:, machine.driven], 1e-4)
-        result &= np.linalg.norm(off, axis=-1) < 0.02
-        result &= lowest_point(frames) > machine.ground + 0.1
-        v = v_goal + off  # the second term brings the tool back to its path in 1 s
+        v = v_goal[rows] + off  # the second term brings the tool back to its path in 1 s
         q_dot = np.zeros_like(q)
         q_dot[:, machine.driven] = (J_inv @ v[..., None])[..., 0]
         speed = q_dot * lever_arm(machine, q)  # dq/dt = v / r(q)
-        q, p_goal = q + q_dot * machine.dt, p_goal + v_goal * machine.dt
-        fits = (q > low) & (q < high) & (speed > down) & (speed < up)
-        result &= fits[:, machine.driven].all(axis=-1)
-    return result
+        q, p_goal = q + q_dot * machine.dt, p_goal + v_goal[rows] * machine.dt
+        inside = (q > low) & (q < high) & (speed > down) & (speed < up)
+        fits &= inside[:, machine.driven].all(axis=-1)
+        rows, q, q_dot, p_goal = (array[fits] for array in (rows, q, q_dot, p_goal))
+    return np.isin(np.arange(len(start)), rows)
 
 
 def tuning_set(machine: Machine, num: int, seed: int, seconds: float = 20.0) -> tuple[Array, Array]:
