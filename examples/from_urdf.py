@@ -148,7 +148,7 @@ def limits(chain: Chain, i: int) -> tuple[float, float, float]:
     turns = not slides and np.isin(np.abs([low, high]).round(2), [3.14, 6.28]).any()
     if turns or not usable:
         warn(f"{name}: the limits {low:g} to {high:g} look like placeholders: measure its range")
-    elif not slides and max(-low, high) > 2 * np.pi:
+    elif not slides and (max(-low, high) > 2 * np.pi or high - low > 3 * np.pi):
         warn(f"{name}: the limits {low:g} to {high:g} rad look like degrees")
     if not usable:
         low, high = (0.0, 1.0) if slides else (-np.pi, np.pi)

@@ -29,6 +29,7 @@ OTHER = re.compile(
     r"(?:[0-9A-Fa-f]{8}[# ]|[0-9A-Fa-f]{3}(?:#R|##|#\w{16}_| +\[(?:\d{2}|9)\]| +\[0\] +remote)).*\n"
 )
 NOTES = ("operator", "timing", "valves", "shadow")  # no buses: what `drive` notes beside the frames
+FALLS = 0.01  # of the rows; if a clock was set, time falls once
 OTHERS = (".asc", ".blf", ".trc", ".gz")  # that python-can reads
 
 
@@ -47,7 +48,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
                 if (frame := plain_frame(message)).id >= 0:
                     yield frame
         return
-    strange = ""
+    strange, before, falls = "", 0.0, 0
     with expected(path, "a candump log"), open(path, encoding="utf-8-sig") as file:
         for row, line in enumerate(file, 1):
             wanted = "(time) bus identifier#data, as candump -l writes"
@@ -57,6 +58,9 @@ def read_frames(path: Path) -> Iterator[Frame]:
                 data = bytes.fromhex(digits)
                 require(int(length or len(data)) == len(data), f"row {row}", wanted, brief(line))
                 one_bus(buses, bus)
+                falls, before = falls + (float(time) < before), float(time)
+                wanted = "times that rise (candump -ta, or -l; with -td they are differences)"
+                require(falls <= FALLS * max(row, 300), f"row {row}", wanted, brief(line))
                 yield Frame(float(time), int(can_id, 16), data, direction == "T")
             elif line.endswith("\n"):
                 require(bool(OTHER.fullmatch(line)), f"row {row}", wanted, brief(line))

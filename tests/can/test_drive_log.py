@@ -75,6 +75,9 @@ def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
     (tmp_path / "log.csv").write_text(two)
     with pytest.raises(ValueError, match=r"frames of one bus .*, got can0 and can1"):
         list(read_frames(tmp_path / "log.csv"))
+    (tmp_path / "log.csv").write_text("(0.045) can0 123#01\n(0.005) can0 124#01\n" * 9)
+    with pytest.raises(ValueError, match=r"row 8: expected times that rise .*-td.*, got '.0.005"):
+        list(read_frames(tmp_path / "log.csv"))
     (tmp_path / "log.csv").write_bytes(bytes(range(256)))
     with pytest.raises(ValueError, match=r"log\.csv: expected a candump log, got"):
         list(read_frames(tmp_path / "log.csv"))
