@@ -271,7 +271,7 @@ class TrainingSet:
         mean, std = (np.repeat(x, H, axis=1) for x in moments)  # (n, I); alike for all 13 samples
 
         def tensor(array: Array) -> Tensor:
-            return torch.from_numpy(np.array(array, np.float32))
+            return torch.from_numpy(np.array(array, np.float32, order="C"))
 
         self.samples = tensor(signals.transpose(2, 1, 0))  # angle, velocity, command, (n, N, 3)
         self.histories_from = self.samples.flatten(0, 1).unfold(0, H, 1)  # each sample, (nN, 3, H)

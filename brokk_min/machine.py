@@ -159,6 +159,7 @@ class Machine:
         joints: Any = self.joints  # of a user, who may have given anything
         some = isinstance(joints, tuple) and joints and all(isinstance(j, Joint) for j in joints)
         require(bool(some), "joints", "a tuple of one Joint or more", joints)
+        require(bool(self.name), "name", "a name", "none")
         slower = min(self.rate, self.tool_speed)
         require(slower > 0, "rate, tool_speed", "positive numbers", slower)
         bits = self.encoder_bits
@@ -228,7 +229,10 @@ class Measured(NamedTuple):
 
 
 class Controller(Protocol):
-    """What can drive a machine: a policy, the PIDs, an operator."""
+    """What can drive a machine: a policy, the PIDs, an operator.
+
+    What it knows from tick to tick is its state, because one may drive several batches side by side.
+    """
 
     def start(self, num: int) -> Any:
         """State of `num` controllers at rest."""

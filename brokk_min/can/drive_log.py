@@ -29,7 +29,7 @@ OTHER = re.compile(
     r"(?:[0-9A-Fa-f]{8}[# ]|[0-9A-Fa-f]{3}(?:#R|##|#\w{16}_| +\[(?:\d{2}|9)\]| +\[0\] +remote)).*\n"
 )
 NOTES = ("operator", "timing", "valves", "shadow")  # no buses: what `drive` notes beside the frames
-FALLS = 0.01  # of the rows; if a clock was set, time falls once
+FALLS = 0.01  # of the rows: time falls once if a clock was set, in differences each tick
 OTHERS = (".asc", ".blf", ".trc", ".gz")  # that python-can reads
 
 
@@ -37,7 +37,8 @@ def read_frames(path: Path) -> Iterator[Frame]:
     """The data frames of a log with 11 bits, one by one, because a day of driving has millions.
 
     Other frames are left out, and a last line without its newline: the program that wrote it was
-    killed. ValueError: no such log, frames of two buses, or a line that is none of candump's.
+    killed. ValueError: no such log, frames of two buses, times that fall, or a line that is none of
+    candump's.
     """
     buses: dict[Any, None] = {}
     if Path(path).suffix.lower() in OTHERS:
@@ -58,7 +59,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
                 data = bytes.fromhex(digits)
                 require(int(length or len(data)) == len(data), f"row {row}", wanted, brief(line))
                 one_bus(buses, bus)
-                falls, before = falls + (float(time) < before), float(time)
+                falls, before = falls + (float(time) < before - 1e-3), float(time)
                 wanted = "times that rise (candump -ta, or -l; with -td they are differences)"
                 require(falls <= FALLS * max(row, 300), f"row {row}", wanted, brief(line))
                 yield Frame(float(time), int(can_id, 16), data, direction == "T")

@@ -115,7 +115,9 @@ def evaluate(
 ) -> tuple[Table, Traces]:
     """Run every controller on the same sequences, starts and noise. Paper: Sec. 4.2, Fig. 6
 
-    `starts` are angles [rad] (starts, n); `noise` of the sensors is that of training. Returns one
+    `starts` are angles [rad] (starts, n); `noise` of the sensors is that of training. The machines
+    of all controllers are one batch, because a tick of many costs hardly more than one of few.
+    Returns one
     row per controller, sequence and start, see `metrics`, with None for nan; and traces.
     """
     p_start = tool_position(forward_kinematics(machine, starts))

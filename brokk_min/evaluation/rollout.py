@@ -81,8 +81,8 @@ def rollout(
     """Let one controller follow given goals from rest. Paper: Fig. 3
 
     `start` are angles [rad] (num, n), `goals` tool velocities during each tick [m/s] (T, num, 3),
-    `noise` the largest of the sensors [deviations]. No episode ends. All this is there in so many
-    `copies`, below each other in one batch.
+    `noise` the largest of the sensors [deviations]. No episode ends. The batch is so many `copies`
+    of these runs below each other, with the same noise in each.
     """
 
     def copied(rows: ArrayLike) -> Array:
