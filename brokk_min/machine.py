@@ -231,7 +231,7 @@ class Measured(NamedTuple):
 class Controller(Protocol):
     """What can drive a machine: a policy, the PIDs, an operator.
 
-    What it knows from tick to tick is its state, because one may drive several batches side by side.
+    What it knows from tick to tick is its state: one may drive several batches side by side.
     """
 
     def start(self, num: int) -> Any:
