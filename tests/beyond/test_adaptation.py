@@ -1,6 +1,8 @@
 """Adaptation: what it learns of known valves, what it leaves alone, and the files it keeps."""
 
 import json
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -26,22 +28,26 @@ NET, DRIVEN = POLICY.net, BROKK_170.driven
 VARIED = variations(BROKK_170)
 
 
-@pytest.fixture(scope="module")
-def drives():
-    """Starts [rad] and goals [m/s] of eight runs of 20 s."""
-    return sequences.tuning_set(BROKK_170, 8, 55, 20.0)
+DRIVES = sequences.tuning_set(BROKK_170, 8, 55, 20.0)  # starts [rad], goals [m/s] of 20 s
 
 
-def driven(truth, drives, controller=POLICY, **fields):
-    """The adaptive controller after the drives on a machine, and its mean error [m/s]."""
-    learner = Adaptive(controller, NET, BROKK_170, **fields)
-    trace = rollout(truth, learner, *drives, 0.05, np.random.default_rng(0))
-    return learner, np.linalg.norm(drives[1] - trace.v_tool, axis=-1).mean()
+class Result(NamedTuple):
+    error: float
+    plain: float
+    known: Known
 
 
-def plain(truth, drives):
-    trace = rollout(truth, POLICY, *drives, 0.05, np.random.default_rng(0))
-    return np.linalg.norm(drives[1] - trace.v_tool, axis=-1).mean()
+def error_of(truth, controller):
+    """Its mean error on the drives [m/s]."""
+    trace = rollout(truth, controller, *DRIVES, 0.05, np.random.default_rng(0))
+    return np.linalg.norm(DRIVES[1] - trace.v_tool, axis=-1).mean()
+
+
+@cache
+def driven(name):
+    """What our agent learns in the drives, with its error as it learns and without."""
+    learner = Adaptive(POLICY, NET, BROKK_170)
+    return Result(error_of(VARIED[name], learner), error_of(VARIED[name], POLICY), learner.known)
 
 
 @pytest.mark.parametrize(
@@ -52,35 +58,34 @@ def plain(truth, drives):
         ("dead zone 5 %", (0.93 / 0.95,) * 2, 0.02 / 0.93),
     ],
 )
-def test_adaptive__learns_speed_and_opening_of_each_valve_and_needs_less(name, k, d, drives):
-    learner, error = driven(VARIED[name], drives)
-    seen = learner.known.seconds > 2.0
-    found_k, found_d = (np.where(seen, of, np.nan) for of in valves(learner.known))
+def test_adaptive__learns_speed_and_opening_of_each_valve_and_needs_less(name, k, d):
+    error, plain, known = driven(name)
+    seen = known.seconds > 2.0
+    found_k, found_d = (np.where(seen, of, np.nan) for of in valves(known))
     assert seen.any(axis=0).all()  # each valve has moved in some run
     np.testing.assert_allclose(np.nanmean(found_k, axis=0), np.tile(k, (4, 1)), atol=0.1)
     np.testing.assert_allclose(np.nanmean(found_d, axis=0), d, atol=0.012)
-    assert error < 0.9 * plain(VARIED[name], drives)
+    assert error < 0.9 * plain
 
 
 @pytest.mark.parametrize("name", ["nominal", "delay +50 ms", "supply flow -70 %"])
-def test_adaptive__changes_nothing_where_the_valves_are_those_of_the_logs(name, drives):
-    learner, error = driven(VARIED[name], drives)
-    assert error == pytest.approx(plain(VARIED[name], drives), rel=0.012)
-    assert abs(valves(learner.known)[0] - 1).mean() < 0.03
+def test_adaptive__changes_nothing_where_the_valves_are_those_of_the_logs(name):
+    error, plain, known = driven(name)
+    assert error == pytest.approx(plain, rel=0.012)
+    assert abs(valves(known)[0] - 1).mean() < 0.03
 
 
-def test_adaptive__only_listens_if_it_does_not_apply(drives):
-    learner, error = driven(VARIED["valve gain -20 %"], drives, applies=False)
-    assert error == pytest.approx(plain(VARIED["valve gain -20 %"], drives), rel=1e-6)
+def test_adaptive__only_listens_if_it_does_not_apply():
+    learner = Adaptive(POLICY, NET, BROKK_170, applies=False)
+    error = error_of(VARIED["valve gain -20 %"], learner)
+    assert error == pytest.approx(driven("valve gain -20 %").plain, rel=1e-6)
     np.testing.assert_allclose(valves(learner.known)[0].mean(), 0.8, atol=0.05)
 
 
-def test_adaptive__goes_on_with_what_it_knows_and_begins_anew_for_other_numbers(drives):
-    truth = VARIED["valve gain -20 %"]
-    learner, cold = driven(truth, drives)
-    _, warm = driven(truth, drives, known=learner.known)
-    assert warm < 0.97 * cold
-    start, goals = drives
+def test_adaptive__goes_on_with_what_it_knows_and_begins_anew_for_other_numbers():
+    truth, (cold, _, known) = VARIED["valve gain -20 %"], driven("valve gain -20 %")
+    learner, (start, goals) = Adaptive(POLICY, NET, BROKK_170, known), DRIVES
+    assert error_of(truth, learner) < 0.97 * cold
     rollout(truth, learner, start[:2], goals[:20, :2], 0.0, np.random.default_rng(0))
     assert learner.known.seconds.shape == (2, 4, 2) and learner.known.seconds.max() < 1.01
 
@@ -146,9 +151,8 @@ def test_learn__counts_no_tick_at_the_end_of_a_range():
     assert seconds[0, :3].max() == 0  # nothing else has moved
 
 
-def test_describe__says_how_each_valve_differs_and_when_to_fit_again(drives):
-    learner, _ = driven(VARIED["valve gain -20 %"], drives)
-    one = Known(*(of[:1] for of in learner.known))
+def test_describe__says_how_each_valve_differs_and_when_to_fit_again():
+    one = Known(*(of[:1].copy() for of in driven("valve gain -20 %").known))
     lines = [*describe(BROKK_170, one)]
     assert len(lines) == 8 and lines[0].startswith("q1 up: ")
     assert all("slower than in the logs, opens " in line for line in lines)
@@ -157,9 +161,8 @@ def test_describe__says_how_each_valve_differs_and_when_to_fit_again(drives):
     assert "log and fit the machine again" in [*describe(BROKK_170, one)][-1]
 
 
-def test_known__is_kept_in_a_file_of_this_machine_and_these_nets(tmp_path, drives):
-    learner, _ = driven(BROKK_170, drives)
-    path, one = tmp_path / "valves.json", Known(*(of[:1] for of in learner.known))
+def test_known__is_kept_in_a_file_of_this_machine_and_these_nets(tmp_path):
+    path, one = tmp_path / "valves.json", Known(*(of[:1] for of in driven("nominal").known))
     save_known(path, BROKK_170, NET, one)
     for kept, of in zip(load_known(path, BROKK_170, NET), one, strict=True):
         np.testing.assert_allclose(kept, KEPT * of)
@@ -199,8 +202,8 @@ def test_from_log__finds_the_same_in_recordings():
     np.testing.assert_allclose(from_log(BROKK_170, NET, mixed).A, alone + rest, rtol=1e-3, atol=1)
 
 
-def test_cold_and_warm__begin_with_nothing_and_with_a_minute(drives):
-    motions = [(drives[0][:2], drives[1][:200, :2])] * 2
+def test_cold_and_warm__begin_with_nothing_and_with_a_minute():
+    motions = [(DRIVES[0][:2], DRIVES[1][:200, :2])] * 2
     both = adaptive.cold_and_warm(
         {"idle": Idle(), "rl": POLICY}, NET, BROKK_170, BROKK_170, 5, motions
     )
@@ -226,11 +229,11 @@ class Off:
 
 
 @pytest.mark.parametrize("ticks", [0, 200])
-def test_learn__counts_hardly_a_tick_once_the_engine_is_off(ticks, drives):
-    start, goals = drives
+def test_learn__counts_hardly_a_tick_once_the_engine_is_off(ticks):
+    start, goals = DRIVES
     off, on = (Adaptive(POLICY, NET, BROKK_170, unknown((8, 4))) for _ in range(2))
     rng = np.random.default_rng
-    trace = rollout(BROKK_170, off, *drives, TaskConfig.noise, rng(0), Off(ticks))
+    trace = rollout(BROKK_170, off, *DRIVES, TaskConfig.noise, rng(0), Off(ticks))
     assert np.abs(trace.u[ticks:]).max() > 0.3
     if ticks:
         rollout(BROKK_170, on, start, goals[:ticks], TaskConfig.noise, rng(0))
