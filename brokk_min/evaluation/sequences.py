@@ -26,6 +26,7 @@ REST_SEED = 2026  # of the scored rests; nothing else draws from it
 SECONDS = 26.0  # of a scored sequence, assumed
 SHORTEST_REST, LONGEST_REST = 0.5, 10.0  # s, assumed
 DRAWS, POSES = 50, 400  # so often so many motions are drawn, to find feasible ones (assumed)
+STARTS_OF = 4000  # poses, of which a few can follow all scored motions (assumed)
 TUNING = TaskConfig(zero_goals=0.3, hold_min_s=0.5, hold_max_s=3.0)  # assumed
 # Rows of seconds and velocity in fractions of tool_speed (assumed).
 # On one axis, as in the paper, with changes of direction:
@@ -138,7 +139,7 @@ def draw_starts(machine: Machine, num: int, sequences: Sequence[Commands], seed:
     rng = np.random.default_rng(seed)
 
     def draw() -> Array:
-        poses = draw_pose(machine, TUNING, rng, 10 * POSES).round(4)  # few stay
+        poses = draw_pose(machine, TUNING, rng, STARTS_OF).round(4)
         poses = np.clip(poses, machine.column("q_min"), machine.column("q_max"))
         for sequence in sequences:
             poses = poses[feasible(machine, poses, sequence.for_starts(machine, poses))]

@@ -12,7 +12,7 @@ from helpers_machines import POSE, Idle, coarse, obedient_net, one_by_one, pids,
 
 from brokk_min._files import digest
 from brokk_min.actuator import cylinder_speeds, hydraulics_of
-from brokk_min.evaluation import adaptive, baselines, metrics, report, reproduce
+from brokk_min.evaluation import adaptive, baselines, metrics, report, reproduce, sequences
 from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.claims import TEXTS
 from brokk_min.evaluation.reproduce import Budget, robustness, variations
@@ -39,7 +39,7 @@ def coarse_png(figure):
 
 @pytest.fixture(scope="module", autouse=True)
 def short_robustness():
-    """Few drives warm up, and the chain measures robustness on the machine itself alone."""
+    """Few drives warm up, starts are of few poses, and the machine of robustness is the usual."""
 
     def nominal(*task):
         return {"nominal": robustness(*task)["nominal"]}
@@ -47,6 +47,7 @@ def short_robustness():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(adaptive, "DRIVES", 2)
         patch.setattr(adaptive, "PARTS", 1)
+        patch.setattr(sequences, "STARTS_OF", 400)
         patch.setattr(reproduce, "robustness", nominal)
         yield
 

@@ -90,7 +90,7 @@ def test_read_starts__refuses_what_is_no_start(tmp_path, row):
 
 
 def test_evaluation_starts__of_the_package_are_those_of_reproduce(monkeypatch):
-    monkeypatch.setattr(s, "POSES", 40)  # faster; two are among the first 400
+    monkeypatch.setattr(s, "STARTS_OF", 400)  # faster, with the same first ones
     starts, sequences = s.evaluation_starts(BROKK_170, 32, [], 0), s.task_sequences(BROKK_170)
     assert len(np.unique(starts, axis=0)) == 32
     assert np.histogram(starts[:, 0], [-2.14, -0.7, 0.7, 2.14])[0].min() >= 5
