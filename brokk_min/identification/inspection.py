@@ -370,15 +370,19 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
             yield f"{wanted} in all recordings or in none, got some in {brief(report.opposite)}"
 
 
+Check = tuple[Any, str, str, str]  # if it holds: the place, what was expected there, what it got
+
+
+def another(name: str, r: JointReport) -> Check:
+    """Does a joint move by the commands of another one?"""
+    return r.other, name, f"motion by u_{name}", f"motion by u_{r.other}: are columns mixed up?"
+
+
 def mixed_up(reports: Mapping[str, JointReport]) -> Iterator[str]:
     """Joints that move by the commands of another one, in words."""
     for name, r in reports.items():
         if r.other:
-            got = f"motion by u_{r.other}: are columns mixed up?"
-            yield f"{name}: expected motion by u_{name}, got {got}"
-
-
-Check = tuple[Any, str, str, str]  # if it holds: the place, what was expected there, what it got
+            yield "{1}: expected {2}, got {3}".format(*another(name, r))
 
 
 def causes(name: str, r: JointReport) -> Iterator[Check]:
@@ -387,7 +391,7 @@ def causes(name: str, r: JointReport) -> Iterator[Check]:
     got = f"motion at so many times the speed of others {r.follows}: {doubt}"
     yield r.follows, f"q_{name}", "rest without commands", got
     yield r.early, name, "motion after its commands", f"it {r.early:.2f} s before: another clock?"
-    yield r.other, name, f"motion by u_{name}", f"motion by u_{r.other}: are columns mixed up?"
+    yield another(name, r)
     got = f"steps of {r.step:.3g} rad (of the encoder, or noise): {r.explained:.0%} of single"
     got = f"{got} ticks and {r.coarse:.0%} of {COARSE} s are explained"
     noise = r.coarse > max(r.explained + COARSER, LEAST_EXPLAINED)
