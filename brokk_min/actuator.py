@@ -113,6 +113,7 @@ def hydraulics_of(machine: Machine) -> Hydraulics:
         h = HYDRAULICS[h]
     else:
         require(isinstance(h, Hydraulics), "hydraulics", "actuator.Hydraulics", h)
+        require(isinstance(h.cylinders, Mapping), "cylinders", "those by joint", h.cylinders)
         known = set(h.cylinders) <= set(machine.names)
         require(known, "cylinders", f"those of joints {[*machine.names]}", [*h.cylinders])
     for joint in machine.joints:

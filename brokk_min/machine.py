@@ -159,7 +159,7 @@ class Machine:
         joints: Any = self.joints  # of a user, who may have given anything
         some = isinstance(joints, tuple) and joints and all(isinstance(j, Joint) for j in joints)
         require(bool(some), "joints", "a tuple of one Joint or more", joints)
-        require(bool(self.name), "name", "a name", "none")
+        require(all([self.name, *self.names]), "name", "one of machine and joints", "none")
         slower = min(self.rate, self.tool_speed)
         require(slower > 0, "rate, tool_speed", "positive numbers", slower)
         bits = self.encoder_bits

@@ -174,4 +174,6 @@ def main(log: str, policy: str, name: str = "brokk170") -> None:
 
 
 if __name__ == "__main__":
+    if not 3 <= len(sys.argv) <= 4:
+        sys.exit(__doc__)
     main(*sys.argv[1:])

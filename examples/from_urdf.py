@@ -147,7 +147,8 @@ def limits(chain: Chain, i: int) -> tuple[float, float, float]:
     usable = -100 < low < high < 100
     turns = not slides and np.isin(np.abs([low, high]).round(2), [3.14, 6.28]).any()
     if turns or not usable:
-        warn(f"{name}: the limits {low:g} to {high:g} look like placeholders: measure its range")
+        doubt = "look like placeholders or degrees: measure its range; a bus needs less than a turn"
+        warn(f"{name}: the limits {low:g} to {high:g} {doubt}")
     elif not slides and (max(-low, high) > 2 * np.pi or high - low > 3 * np.pi):
         warn(f"{name}: the limits {low:g} to {high:g} rad look like degrees")
     if not usable:
@@ -166,7 +167,8 @@ def make_machine(chain: Chain) -> Machine:
         name, kind = chain.model.names[chain.joints[i]], KINDS[chain.slides[i]]
         row = a, alpha, d, theta, low, high, speed, speed, i + 1
         if max(abs(a), abs(d)) > LONGEST:
-            warn(f"{name}: its link of {max(abs(a), abs(d)):g} m looks like millimetres")
+            doubt = "m looks like centimetres or millimetres"
+            warn(f"{name}: its link of {max(abs(a), abs(d)):g} {doubt}")
         joints.append(Joint(name, True, *row, kind=kind))
     last = joints[-1]
     if last.kind == "revolute" and abs(last.a) < COINCIDENT:

@@ -36,7 +36,7 @@ def joint_names(dataset: Path) -> tuple[list[str], list[str]]:
         names = names or (both[0] if both else [f"joint_{i}" for i in range(shapes[0][0])])
         both.append([name.removesuffix(".pos") for name in names])
     angles, commands = both
-    if sorted(angles) != sorted(commands):
+    if sorted({*angles}) != sorted(commands):  # or a name stands twice
         raise SystemExit(f"{dataset}: expected {COMMANDS} of {angles}, got {commands}")
     return angles, commands
 

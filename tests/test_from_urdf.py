@@ -90,7 +90,7 @@ def test_rounded_right_angles__count_as_parallel(tmp_path, capsys):
     [
         (2, 6, 35, "boom: the limits -1.1 to 35 rad look like degrees"),
         (2, slice(5, 7), (-5, 5), "boom: the limits -5 to 5 rad look like degrees"),
-        (3, 2, "1800 0 0", "boom: its link of 1800 m looks like millimetres"),
+        (3, 2, "1800 0 0", "boom: its link of 1800 m looks like centimetres or millimetres"),
         (6, 2, "0.1 -0.45 0.2", "bucket: cannot move the tool, which lies on its axis"),
     ],
 )

@@ -49,9 +49,11 @@ class Evaluate(Command):
         policies, net = dict(zip(names, loaded, strict=True)), loaded[0].net
         plant = net if self.plant == "net" else find_plant(self.plant, machine)
         commands, starts = self.task(machine)
-        controllers: dict[str, Controller] = {**policies, **self.pids(machine, net, plant, gains)}
-        if self.controller:
-            controllers[self.controller] = own_controller(self.controller, machine, net)
+        own: dict[str, Controller] = {}
+        if self.controller:  # before PIDs are tuned
+            own[self.controller] = own_controller(self.controller, machine, net)
+        pids = self.pids(machine, net, plant, gains)
+        controllers: dict[str, Controller] = {**policies, **pids, **own}
         if self.adapt:
             rows, motions = len(commands) * len(starts), adaptive.warm_up_motions(machine)
             controllers |= adaptive.cold_and_warm(

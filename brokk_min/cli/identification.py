@@ -59,6 +59,7 @@ class ReadsLogs(Command):
         """
         once = len({path.resolve() for path in paths}) == len(paths) > 0
         check(once, "LOGS", "one file or more, each once", " ".join(map(str, paths)) or "none")
+        check(len({*self.topics}) == 2, "--topics", "two topics", " ".join(self.topics))
         tables = not self.map or any(map(is_table, paths))
         check(tables, "--map", "a table or a recording of ROS", paths[0])
         log = logs.join_logs({path: self.read_log(path, machine) for path in paths})

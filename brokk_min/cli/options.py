@@ -17,7 +17,7 @@ from brokk_min._files import NEW, SHIPPED, brief, expected
 from brokk_min.actuator import PLANT, ActuatorNet, Plant, stands_in
 from brokk_min.evaluation.baselines import Baselines, read_gains
 from brokk_min.learning.policy import load_policy
-from brokk_min.machine import BROKK_170, PWM_MAX, Controller, Machine, require
+from brokk_min.machine import BROKK_170, PWM_MAX, Array, Controller, Machine, Measured, require
 
 LONGEST = 100  # m: no link is so long, but in millimetres most are
 FRACTIONS = ("gamma", "gae_lambda", "zero_goals", "axis_goals", "noise", "weight_decay")
@@ -126,7 +126,7 @@ def find_plant(name: str, machine: Machine) -> Plant:
     if name == "analytic":
         if stands_in(machine):
             got = "a machine without hydraulics: those of the analytic plant are made up"
-            warning = f"warning: --plant: expected one of your own, or net, got {got}"
+            warning = f"warning: --plant: expected FILE.py:NAME, or net of evaluate, got {got}"
             print(warning, file=sys.stderr)
         return PLANT
     plant = OwnPlant(name, load_object("--plant", name))
@@ -176,7 +176,29 @@ def own_controller(name: str, machine: Machine, net: ActuatorNet) -> Controller:
     with expected(Path(name), "a function of machine and nets that gives a Controller"):
         controller: Controller = make(machine, net)
         require(callable(controller.start), "start", "a method", controller.start)
-    return controller
+    return OwnController(name, machine, controller)
+
+
+@dataclass(frozen=True)
+class OwnController:
+    """A controller of the user's file, whose every command is looked at. Errors are ValueErrors."""
+
+    name: str
+    machine: Machine
+    inner: Controller
+
+    def start(self, num: int) -> Any:
+        """Its state, for `num` machines."""
+        return self.inner.start(num)
+
+    def __call__(self, measured: Measured, state: Any) -> tuple[Array, Any]:
+        """ValueError: whatever the file does, or what are no finite commands (num, n)."""
+        with expected(Path(self.name), "a controller that returns commands and its state"):
+            u, state = self.inner(measured, state)
+            shape = (len(measured.q), self.machine.n)
+            require(np.shape(u) == shape, "commands", f"an array {shape}", np.shape(u))
+            require(bool(np.isfinite(u).all()), "commands", "finite numbers", brief(u))
+        return u, state
 
 
 def default_policy(machine: Machine, policy: Path | None) -> tuple[Path, Path | None]:

@@ -207,5 +207,6 @@ def first(machine: Machine, num: int, draw: Callable[[], Iterable[Any]]) -> list
     draws = chain.from_iterable(draw() for _ in range(DRAWS))
     found = list(tqdm(islice(draws, num), "draw starts", num, leave=False, disable=None))
     wanted = "from which the arm stays on its path, above the ground and within ranges and speeds"
-    require(len(found) == num, machine.name, f"{num} starts {wanted}", len(found))
+    doubt = f"{len(found)}: is tool_speed too large?"
+    require(len(found) == num, machine.name, f"{num} starts {wanted}", doubt)
     return found

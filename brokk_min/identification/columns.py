@@ -64,7 +64,9 @@ def load_table(
 
 def find_columns(path: Path, table: Mapping[str, Any], mapped: Mapped) -> dict[str, Any]:
     """The columns of `load_table` in a table of any others."""
-    joints = dict.fromkeys(name[2:] for name in (*table, *mapped) if name.startswith("u_"))
+    renamed = {column for column, _ in mapped.values()} - {*mapped}
+    names = [name for name in (*table, *mapped) if name not in renamed]
+    joints = dict.fromkeys(name[2:] for name in names if name.startswith("u_"))
     joints |= dict.fromkeys(name[2:] for name in mapped if name.startswith("q_"))
     require(len(joints) > 0, "columns", "u_<joint> (--map u_NAME=COLUMN:UNIT)", brief(list(table)))
     times = [name for name in ("time", COMMAND_TIME) if name in ("time", *table)]
@@ -102,6 +104,7 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
     command = name.startswith("u_")
     limit = 1.0 if command else LARGEST
     unread = np.isnan(result) & name.startswith("q_")
+    require(not unread.size or not unread.all(), f"column {name}", "numbers", "nan in all rows")
     for row in np.flatnonzero(~(np.abs(result) <= limit) & ~unread):  # also where it is nan
         largest = np.fmax.reduce(np.abs(result), initial=0.0)  # but nan
         units = {

@@ -165,7 +165,8 @@ def opposite(recordings: Sequence[Recording], j: int, rate: float) -> list[str]:
     names, signs = [], []
     for one in recordings:
         u, q, q_dot = one.u[:, j], one.q[:, j], one.q_dot[:, j]
-        if np.ptp(u) > COMMANDED and np.ptp(q) > MOVED:
+        second = np.convolve(q, np.ones(round(rate)) / rate, "valid")  # without noise
+        if np.ptp(u) > COMMANDED and np.ptp(second) > MOVED:
             names.append(one.name)  # less the means, because a joint may sag all the time
             signs.append(sign(u - u.mean(), q_dot - q_dot.mean(), rate, OPPOSITE))
     fewer = -np.sign(sum(signs)) or 1
@@ -423,7 +424,7 @@ def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
     width, got = joint.q_max - joint.q_min, f"{r.low:.2f} to {r.high:.2f}"
     low, high = np.deg2rad([r.low, r.high])
     turned = min(beyond(low, high, joint), beyond(-high, -low, joint)) < BEYOND * width
-    turned &= r.high - r.low > width or max(-r.low, r.high) > 2 * np.pi  # else it would fit
+    turned &= r.high - r.low > 2 * width or max(-r.low, r.high) > 2 * np.pi  # else it would fit
     doubt = f"in degrees (--map {name}=COLUMN:deg, or -deg)" if turned else "another zero or joint"
     outside = beyond(r.low, r.high, joint) > BEYOND * width
     yield outside, f"q_{name}", f"{joint.q_min:g} to {joint.q_max:g}", f"{got}: {doubt}?"

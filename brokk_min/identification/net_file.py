@@ -65,6 +65,10 @@ def select_nets(machine: Machine, net: ActuatorNet) -> ActuatorNet:
     known = set(joints) <= set(net.joints)
     require(known, "joints", f"nets for {list(joints)}", list(net.joints))
     index = [net.joints.index(name) for name in joints]
+    if "dead_zones" in vars(net):  # of nets that read openings
+        zones, given = vars(net)["dead_zones"][index], machine.dead_zones[machine.driven]
+        same = np.allclose(zones, given)
+        require(same, "dead_zone", f"those of the nets {zones.tolist()}", given.tolist())
     changes: dict[str, Any] = {"joints": joints, "weights": tuple(w[index] for w in net.weights)}
     changes |= {name: x[index] for name, x in vars(net).items() if isinstance(x, np.ndarray)}
     return replace(net, **changes)

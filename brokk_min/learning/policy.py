@@ -105,7 +105,7 @@ def load_policy(path: Path, machine: Machine) -> Policy:
         expect_same(path, header["contract"], contract(machine, header["interface"]))
         mean, scale = INTERFACES[header["interface"]].scale(machine)
         fits = np.array_equal(arrays["mean"], mean) and np.array_equal(arrays["scale"], scale)
-        require(fits, str(path), f"the machine's scale of {header['interface']}", "another")
+        require(fits, str(path), "the machine's tool_speed, q_dot_up and q_dot_down", "others")
         own = {"mean", "scale", *(f"layer_{i}" for i in range(8))}
         weights = tuple(arrays[f"layer_{i}"] for i in range(8))
         sizes = [len(mean), *(b.size for b in weights[1:7:2]), len(machine.driven)]

@@ -41,6 +41,19 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
     assert evaluate(folder, f"--json {out}") == 2  # it is there
 
 
+BAD = """
+import numpy as np
+class Nan:
+    def __init__(self, machine, net): pass
+    def start(self, num): pass
+    def __call__(self, measured, state): return np.nan * np.ones((len(measured.q), 5)), None
+class Short(Nan):
+    def __call__(self, measured, state): return np.ones((len(measured.q), 2)), None
+class Alone(Nan):
+    def __call__(self, measured, state): return np.ones((len(measured.q), 5))
+"""
+
+
 def test_evaluate__takes_a_controller_of_ones_own(folder, capsys):
     example = Path(__file__).parents[2] / "examples" / "own_controller.py"
     (folder / "own.py").write_text(example.read_text())
@@ -50,6 +63,11 @@ def test_evaluate__takes_a_controller_of_ones_own(folder, capsys):
     own = next(run for run in runs if run["controller"] == name)
     assert own["velocity_error_mean"] < 0.07 < runs[0]["velocity_error_mean"]  # it moves up
     assert f"{name:56}{'-':>15}" in capsys.readouterr().out
+    (folder / "bad.py").write_text(BAD)
+    told = "finite numbers, got", "an array (1, 5), got (1, 2)", "commands and its state, got"
+    for kind, words in zip(("Nan", "Short", "Alone"), told, strict=True):
+        assert evaluate(folder, f"--controller {folder}/bad.py:{kind}") == 1
+        assert words in capsys.readouterr().err
     (folder / "none.py").write_text("NUMBER = 3\n")
     assert evaluate(folder, f"--controller {folder}/none.py:NUMBER") == 1
     assert "NUMBER: expected a function of machine and nets" in capsys.readouterr().err

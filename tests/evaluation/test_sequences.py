@@ -111,8 +111,8 @@ def test_evaluation_starts__are_drawn_by_the_seed_for_another_machine():
 
 
 def test_draw_starts__refuses_a_machine_that_can_follow_nothing(monkeypatch):
-    monkeypatch.setattr(s, "POSES", 3)  # faster
-    with pytest.raises(ValueError, match=r"^brokk170: expected 2 starts .*, got 0$"):
+    monkeypatch.setattr(s, "STARTS_OF", 30)  # faster
+    with pytest.raises(ValueError, match=r"^brokk170: expected 2 starts .*, got 0: is tool_speed"):
         s.draw_starts(BROKK_170, 2, [s.Commands("fast", np.full((2, 3), 9.0))], 0)
 
 

@@ -52,8 +52,11 @@ def test_fingerprint__differs_between_nets():
     assert len({fingerprint(other) for other in (net, *others)}) == 4
 
 
-def machine_with(names):
-    joints = [replace(BROKK_170.joints[0], name=x, encoder_node=i) for i, x in enumerate(names, 1)]
+def machine_with(names, zones):
+    joints = [
+        replace(BROKK_170.joints[0], name=x, encoder_node=i, dead_zone=tuple(zone))
+        for i, (x, zone) in enumerate(zip(names, zones.tolist(), strict=True), 1)
+    ]
     return replace(BROKK_170, name="some", joints=tuple(joints), q_start=())
 
 
@@ -62,11 +65,14 @@ def test_select_nets__predict_as_they_do_among_others(net):
     history = np.random.default_rng(4).uniform(-1, 1, (20, 3, 3, 13)).astype(np.float32)
     for joints in (["j2", "j0"], ["j1"]):
         index = [net.joints.index(name) for name in joints]
-        alone = select_nets(machine_with(joints), net)
+        alone = select_nets(machine_with(joints, ZONES[index]), net)
         assert alone.joints == tuple(joints)
         expected = net.predict(history)[:, index]
         np.testing.assert_allclose(alone.predict(history[:, index]), expected, atol=1e-6)
         np.testing.assert_array_equal(alone.output_low, net.output_low[index])
+        if net is not NETS[0]:  # those that read openings belong to dead zones
+            with pytest.raises(ValueError, match="dead_zone: expected those of the nets"):
+                select_nets(machine_with(joints, ZONES[index] + 0.01), net)
 
 
 def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator(tmp_path):
@@ -78,7 +84,7 @@ def test_select_nets__refuses_nets_of_another_machine_rate_or_estimator(tmp_path
         with pytest.raises(ValueError, match=f"{refusal}.*{value!r}"):
             select_nets(BROKK_170, replace(net, **{name: value}))
     with pytest.raises(ValueError, match=r"joints: expected nets for \['j0', 'j9'\]"):
-        select_nets(machine_with(["j0", "j9"]), random_net())
+        select_nets(machine_with(["j0", "j9"], ZONES[:2]), random_net())
     save_net(tmp_path / "net.npz", replace(net, machine="other"))
     with pytest.raises(ValueError, match=rf"net\.npz: {refusal}"):
         load_net(tmp_path / "net.npz", BROKK_170)

@@ -57,7 +57,10 @@ def test_controller__remembers_how_long_its_goal_is_zero(kind):
     ("change", "message"),
     [
         ({"rate": 40.0}, "rate: expected 40.0, got 20.0"),
-        ({"tool_speed": 0.2}, "expected the machine's scale of paper, got another"),
+        (
+            {"tool_speed": 0.2},
+            "expected the machine's tool_speed, q_dot_up and q_dot_down, got others",
+        ),
     ],
 )
 def test_load_policy__refuses_one_for_another_machine(tmp_path, change, message):
