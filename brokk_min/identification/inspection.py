@@ -40,6 +40,7 @@ OPENS = 0.3  # of full command: it opens any valve
 RESTS = 0.1  # of the expected motion: less is rest
 STILL = 1.5  # s of clear commands without motion; in sound logs of ours up to 1.15, and
 USUALLY, SOUND = 4.0, 0.6  # so many times the quantile of the log's, of sound ones up to 3.1
+SEVERAL = 5  # recordings tell what is usual
 AT_LEAST = (0.9, 0.3)  # s, if less or more of the motion is explained than
 WELL = 0.9  # as without noise, without coarse steps, and where valves open at once
 RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
@@ -308,7 +309,7 @@ def without_still(
         motion = motion_of(kept, j, rate, span)
         model = fit_model(motion)
         seconds = np.array([still_seconds(one, model, motion) for one in each])
-        least = AT_LEAST[model.explained > WELL]
+        least = AT_LEAST[model.explained > WELL and len(recordings) >= SEVERAL]
         usual = np.quantile(seconds, SOUND, method="lower")
         still = stuck | (seconds > np.clip(USUALLY * usual, least, STILL))
         if still.all() or (still == before).all():

@@ -18,6 +18,7 @@ from brokk_min.identification.inspection import (
 )
 from brokk_min.identification.validation import task_log
 from brokk_min.machine import BROKK_170
+from examples.mini_excavator import MINI_EXCAVATOR
 
 TRUE = {  # dead zones, gains [rad/s per full opening], delay [ticks of 0.05 s], tau [s]
     "boom": (0.12, 0.20, 0.5, 0.3, 2, 0.1),
@@ -116,6 +117,8 @@ def test_inspect__finds_no_wrong_sign_in_sound_logs(excitation):
         assert not [*wrong_signs(inspect(collect(BROKK_170, 0.02, rng, PLANT, excitation)))]
     log = task_log(BROKK_170, 5, 8.0, np.random.default_rng(0))
     assert not [*wrong_signs(inspect(log))]
+    few = collect(MINI_EXCAVATOR, 0.01, np.random.default_rng(0), PLANT, RICH)
+    assert inspect(few)["bucket"].still == []  # two of four are at a stop, one rests for 0.48 s
     ticks = np.arange(600)
     creep = np.stack([-0.02 * ticks / 600, 0 * ticks], axis=1)
     u = np.stack([0.004 + 0 * ticks, 0 * ticks], axis=1)
