@@ -14,19 +14,19 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as parquet
 
-from brokk_min._files import whole_file
+from brokk_min._files import expected, whole_file
 
 ANGLES, COMMANDS = "observation.state", "action"
 COLUMNS = [ANGLES, COMMANDS, "timestamp", "episode_index"]
 
 
 def joint_names(dataset: Path) -> tuple[list[str], list[str]]:
-    """Names of angles and commands, or joint_0, joint_1, ...; SystemExit: another format."""
+    """Names of angles and commands, or joint_0, joint_1, ...; ValueError: another format."""
     info = json.loads((dataset / "meta" / "info.json").read_text(encoding="utf-8"))
     shapes = [info["features"].get(key, {}).get("shape") for key in (ANGLES, COMMANDS)]
     if not info["codebase_version"].startswith("v3") or not shapes[0] or shapes[0] != shapes[1]:
         got = f"{info['codebase_version']}, {shapes}"
-        raise SystemExit(f"{dataset}: expected v3, {ANGLES} and {COMMANDS} of one shape, got {got}")
+        raise ValueError(f"{dataset}: expected v3, {ANGLES} and {COMMANDS} of one shape, got {got}")
     both = []
     for key in (ANGLES, COMMANDS):
         names = info["features"][key].get("names")
@@ -37,13 +37,14 @@ def joint_names(dataset: Path) -> tuple[list[str], list[str]]:
         both.append([name.removesuffix(".pos") for name in names])
     angles, commands = both
     if sorted({*angles}) != sorted(commands):  # or a name stands twice
-        raise SystemExit(f"{dataset}: expected {COMMANDS} of {angles}, got {commands}")
+        raise ValueError(f"{dataset}: expected {COMMANDS} of {angles}, got {commands}")
     return angles, commands
 
 
 def main(dataset: str, out: str) -> None:
     """Read all episodes, and write them as one table."""
-    names, commands = joint_names(Path(dataset))
+    with expected(Path(dataset), "a LeRobotDataset with a list of names"):
+        names, commands = joint_names(Path(dataset))
     files = sorted(Path(dataset, "data").glob("*/*.parquet"))
     tables = [parquet.read_table(file, columns=COLUMNS).to_pydict() for file in files]
     q, u, time, episode = (np.array([x for t in tables for x in t[key]]) for key in COLUMNS)
@@ -56,4 +57,7 @@ def main(dataset: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except (OSError, ValueError) as error:
+        sys.exit(str(error))

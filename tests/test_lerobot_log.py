@@ -56,12 +56,15 @@ def test_main__finds_actions_by_their_names(tmp_path):
     write_dataset(tmp_path / "places", places, actions=NAMES)
     main(str(tmp_path / "places"), str(tmp_path / "log.npz"))
     assert read_log(tmp_path / "log.npz", BROKK_170).joints == ("boom", "arm")
-    with pytest.raises(SystemExit, match=r"expected action of \['boom', 'arm'\], got .*'x'"):
+    write_dataset(tmp_path / "nested", NAMES, actions=[["boom.pos"], ["arm.pos"]])
+    with pytest.raises(ValueError, match=r"nested: expected a LeRobotDataset with a list of names"):
+        main(str(tmp_path / "nested"), str(tmp_path / "log.npz"))
+    with pytest.raises(ValueError, match=r"expected action of \['boom', 'arm'\], got .*'x'"):
         main(str(tmp_path / "other"), str(tmp_path / "log.npz"))
 
 
 def test_main__refuses_another_version(tmp_path):
     write_dataset(tmp_path / "set", NAMES, version="v2.1")
-    with pytest.raises(SystemExit, match=r"expected v3, .* got v2\.1"):
+    with pytest.raises(ValueError, match=r"expected v3, .* got v2\.1"):
         main(str(tmp_path / "set"), str(tmp_path / "log.npz"))
     assert not (tmp_path / "log.npz").exists()

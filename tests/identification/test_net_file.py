@@ -42,6 +42,11 @@ def test_load_net__names_file_and_fault(tmp_path, change, message):
     save_arrays(path, "actuator net 6", header | change, **arrays)
     with pytest.raises(ValueError, match=rf"^{path}: {message}"):
         load_net(path)
+    save_arrays(
+        path, "actuator net 6", header, **arrays | {"input_scale": 0 * arrays["input_mean"]}
+    )
+    with pytest.raises(ValueError, match="input_scale: expected positive numbers, got"):
+        load_net(path)
 
 
 def test_fingerprint__differs_between_nets():
