@@ -117,8 +117,7 @@ def evaluate(
 
     `starts` are angles [rad] (starts, n); `noise` of the sensors is that of training. The machines
     of all controllers are one batch, because a tick of many costs hardly more than one of few.
-    Returns one
-    row per controller, sequence and start, see `metrics`, with None for nan; and traces.
+    Returns a row per controller, sequence and start, see `metrics`, with None for nan; and traces.
     """
     p_start = tool_position(forward_kinematics(machine, starts))
     goals = {s.name: s.for_starts(machine, starts) for s in sequences}  # all are one batch

@@ -166,8 +166,7 @@ def opposite(recordings: Sequence[Recording], j: int, rate: float) -> list[str]:
     names, signs = [], []
     for one in recordings:
         u, q, q_dot = one.u[:, j], one.q[:, j], one.q_dot[:, j]
-        second = np.convolve(q, np.ones(round(rate)) / rate, "valid")  # without noise
-        if np.ptp(u) > COMMANDED and np.ptp(second) > MOVED:
+        if np.ptp(u) > COMMANDED and np.ptp(q) > MOVED:
             names.append(one.name)  # less the means, because a joint may sag all the time
             signs.append(sign(u - u.mean(), q_dot - q_dot.mean(), rate, OPPOSITE))
     fewer = -np.sign(sum(signs)) or 1

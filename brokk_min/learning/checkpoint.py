@@ -40,7 +40,7 @@ def quick_products() -> Iterator[None]:
 
     MKL, torch's first choice, uses AVX-512 on Intel's processors alone, and oneDNN on AMD's, too.
     Only "medium" lets torch choose it. That would also allow bfloat16 on AMX, which is therefore
-    hidden, unless the process has multiplied before: products stay in single precision.
+    hidden before the first product of the process: products stay in single precision.
     """
     torch.set_num_threads(1)
     os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_BF16")  # read at the first product

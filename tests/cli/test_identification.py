@@ -138,5 +138,6 @@ def test_inspect__reads_recordings_of_ros(tmp_path, capsys):
     from helpers_ros import drive, multi_array, record
 
     bag = record(tmp_path / "bag", drive(lambda k: multi_array([k / 20, 0.0, -k / 40])))
+    assert run("inspect --topics /valves /valves", bag) == 2
     assert run("inspect --topics /joint_states /valves --map arm=q_arm:-1", bag) == 0
     assert re.search(r'Joint\("arm", q_min=-?0.000, q_max=0.380', capsys.readouterr().out)

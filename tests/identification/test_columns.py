@@ -68,6 +68,15 @@ def test_read_log__says_which_column_and_how_to_map_it(tmp_path, mapping, messag
         read_log(path, BROKK_170, parse_map("time=Zeit,u_boom=Lever,boom=Lever"))
 
 
+def test_load_table__has_renamed_joints_under_their_new_names_alone(tmp_path):
+    rows = {"time": 0.05 * np.arange(3), "u_left": np.zeros(3), "q_left": np.full(3, np.nan)}
+    np.savez(tmp_path / "l.npz", **rows | {"q_a": np.ones(3)})
+    table, _ = load_table(tmp_path / "l.npz", parse_map("a=q_a,u_a=u_left"))
+    assert table.keys() == {"run", "time", "u_a", "q_a"}
+    with pytest.raises(ValueError, match="column q_left: expected numbers, got nan in all rows"):
+        load_table(tmp_path / "l.npz", {})
+
+
 @pytest.mark.parametrize("run", [np.array([3, 3, 3]), np.array([b"3"] * 3), np.array(3), None])
 def test_load_table__takes_numbers_as_names_and_datetimes_as_time(tmp_path, run):
     """A single one is for all rows; a table without `run` is one recording by its file's name."""

@@ -113,6 +113,7 @@ BAD = [
     ({"cylinder": {"speed": (np.nan, 0.1)}}, "q5.speed: expected a pair, up and down, got (nan"),
     ({"gain": (np.nan, 1.0)}, "hydraulics: expected a delay and a pair of gains of 0 or more"),
     ({"cylinders": {"boom": Cylinder()}}, "cylinders: expected those of joints ['q1', 'q2', "),
+    ({"cylinders": None}, "cylinders: expected those by joint, got None"),
     ({"cylinder": {"angle": 0.0}}, "q5.angle: expected angles in (0, pi), got 0.000 to 2.000"),
     ({"cylinder": {"angle": 1.2}}, "q5.angle: expected angles in (0, pi), got 1.200 to 3.200"),
     (
