@@ -116,12 +116,26 @@ def timing(machine: Machine, frames: Iterable[Frame]) -> list[str]:
     return [f"ticks late by {words}; {missed} of {len(late) + missed} missed"]
 
 
+def identifiers(of: Iterable[int]) -> str:
+    """Identifiers as candump prints them."""
+    return " ".join(f"{one:03X}" for one in sorted(of))
+
+
 def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     """Commands and angles while driving, as recordings for `fit`; a gap or jump starts a new one.
 
-    ValueError: nothing was driven for long enough.
+    ValueError: frames of the machine that never come, or nothing was driven for long enough.
     """
-    ticks = [tick for tick in read_telemetry(machine, frames) if tick.driving]
+    missing = {canopen.SYNC, machine.valve_frame_id, *Nodes(machine).position_index}
+    wanted = f"SYNC, positions and valve frames, {identifiers(missing)} (--machine)"
+
+    def noted() -> Iterator[Frame]:
+        for frame in frames:
+            missing.discard(frame.id)
+            yield frame
+
+    ticks = [tick for tick in read_telemetry(machine, noted()) if tick.driving]
+    require(not missing, "log", wanted, f"none with {identifiers(missing)}")
     time = np.array([tick.time for tick in ticks])
     u = np.reshape([tick.u for tick in ticks], (-1, machine.n))
     q = np.reshape([tick.q for tick in ticks], (-1, machine.n))

@@ -140,6 +140,7 @@ class Fit(ReadsLogs):
             every = log._replace(recordings=(*log.recordings, *test.recordings))
         else:
             every, (log, test) = log, logs.split(log)
+        validation.scored_steps(test, machine.history)  # now, not after the fit
         reports = inspection.inspect(every, known)
         for wrong in (*inspection.wrong_signs(reports), *inspection.mixed_up(reports)):
             raise ValueError(f"{self.logs[0]}: {wrong}")

@@ -18,6 +18,7 @@ from brokk_min.identification.ros_logs import COMMAND_TIME, read_ros
 from brokk_min.machine import Array, require
 
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
+COMMAND_UNITS = {100: "percent or :0.00787", 127: "0.00787", 255: "UNIT", 1000: "permille"}  # up to
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # beside folders of ROS
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
@@ -107,15 +108,10 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
     require(not unread.size or not unread.all(), f"column {name}", "numbers", "nan in all rows")
     for row in np.flatnonzero(~(np.abs(result) <= limit) & ~unread):  # also where it is nan
         largest = np.fmax.reduce(np.abs(result), initial=0.0)  # but nan
-        units = {
-            100: "percent or :0.00787",
-            127: "0.00787",
-            255: "UNIT",
-            1000: "permille",
-        }  # 1 / 127
-        unit = next((name for most, name in units.items() if largest <= most), "UNIT")
+        unit = next((name for most, name in COMMAND_UNITS.items() if largest <= most), "UNIT")
         wanted = f"-{limit:g} to {limit:g}"
-        wanted += f" (another unit? --map {name}=COLUMN:{unit}; rest is 0)" if command else ""
+        if command and largest > limit:
+            wanted += f" (another unit? --map {name}=COLUMN:{unit}; rest is 0)"
         raise ValueError(f"row {row + 2}, column {name}: expected {wanted}, got {result[row]}")
     return result
 

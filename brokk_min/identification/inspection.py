@@ -353,11 +353,15 @@ def one_size(u: Array) -> bool:
 
 
 def contradicts(motion: Motion, model: Model) -> bool:
-    """Does a joint move against what the model expects of its commands?"""
+    """Does a joint move against what the model expects of its commands?
+
+    Where it expects no motion, noise moves either way.
+    """
     expected = expected_velocity(motion, model)
     velocity = motion.velocity - motion.velocity.mean()
     size = np.linalg.norm(expected) * np.linalg.norm(velocity)
-    return bool(expected @ velocity < -AGAINST * size)
+    clear = np.ptp(np.cumsum(expected)) / motion.rate > MOVED
+    return bool(clear and expected @ velocity < -AGAINST * size)
 
 
 def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:

@@ -46,6 +46,15 @@ def free_run(
     return q_error, v_error
 
 
+def scored_steps(log: Log, history: int) -> NDArray[np.intp]:
+    """Samples from which one step can be scored; ValueError: there is none."""
+    samples = join_recordings(log)
+    starts = samples.starts(history, 1, 1)
+    wanted = f"a recording above {history + 1} samples to score on"
+    require(len(starts) > 0, "log", wanted, samples.lengths[:9])
+    return starts
+
+
 def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     """One-step, persistence and free-run errors of each joint where it moves, as in the fit JSON.
 
@@ -56,10 +65,7 @@ def score(net: ActuatorNet, log: Log) -> dict[str, Any]:
     ValueError: another rate than the nets', or no recording long enough.
     """
     require(log.rate == net.rate, "rate", f"{net.rate}", log.rate)
-    samples = join_recordings(log)
-    starts = samples.starts(net.history, 1, 1)
-    wanted = f"a recording above {net.history + 1} samples"
-    require(len(starts) > 0, "log", wanted, samples.lengths[:9])
+    samples, starts = join_recordings(log), scored_steps(log, net.history)
     one_step = free_run(net, samples, starts, 1)[0][0] * net.rate
     persistence = samples.q_dot[starts] - samples.target[starts]
     result: dict[str, Any] = {name: {"free_run": {}} for name in net.joints}

@@ -108,6 +108,9 @@ def test_log_for_fit__by_hand():
     refusal = r"15 ticks of driving in a row at 10 Hz \(--machine\), got 11 at most"
     with pytest.raises(ValueError, match=refusal):
         log_for_fit(machine, frames[:100])
+    other = replace(machine, valve_frame_id=0x211)
+    with pytest.raises(ValueError, match=r"valve frames, 080 181 .* 185 211 .*, got none with 211$"):
+        log_for_fit(other, frames)
 
 
 def test_read_telemetry__gives_at_each_sync_the_tick_before():

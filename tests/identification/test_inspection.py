@@ -235,6 +235,10 @@ def test_inspect__names_short_stalls_and_a_joint_that_sags():
     rests = record("boom", 0.1 * np.sin(np.arange(4000)))
     rests = rests._replace(name="rests", q_dot=rests.q_dot - 1e-16 * np.sign(rests.u))
     assert inspect(log_of(*(record("boom", u) for u in SEVEN), rests))["boom"].opposite == []
+    nearly = record("boom", np.repeat([0.0, 0.14, 0.0], [10, 10, 20]))  # it should rise by 5 mrad
+    noisy = nearly._replace(name="noisy", q=-0.6 * nearly.q)
+    reports = inspect(log_of(*(record("boom", u) for u in SEVEN), noisy))
+    assert reports["boom"].opposite == []
 
 
 def test_inspect__tells_steps_of_an_encoder_and_noise_from_another_motion():

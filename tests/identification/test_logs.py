@@ -199,6 +199,7 @@ def test_read_log__takes_semicolons_with_decimal_commas(tmp_path):
             GOOD.replace("0.3", "30"),
             "row 4, column u_a: expected -1 to 1 (another unit? --map u_a=COLUMN:percent or :0.0",
         ),
+        (GOOD.replace("0.3", "nan"), "row 4, column u_a: expected -1 to 1, got nan"),
         (GOOD.replace("0.10", "0.05"), "run x, column time: expected stamps that rise, got a step"),
         (SECOND_EARLIER, "run x, column time: expected stamps that rise, got a step of -0.03 at 1"),
         (
