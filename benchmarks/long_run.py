@@ -7,26 +7,22 @@ A PI controller follows a goal that turns all the time. It prints each stop with
 often the operator had to press, and the memory of the process at the beginning and at the end.
 """
 
-import sys
 import threading
 import time
 from collections import Counter, deque
-from pathlib import Path
 
 import numpy as np
 import psutil
 import tyro
 
 import benchmarks  # noqa: F401, before NumPy computes: one thread
+from benchmarks.one_process import BASELINE, World
 from brokk_min.actuator import PLANT
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.can.connection import open_bus
 from brokk_min.can.simulated_machine import SimulatedMachine, serve, start_pose
 from brokk_min.hw import Drive
 from brokk_min.machine import BROKK_170
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from helpers_bus import BASELINE, World
 
 TURN = np.array([0.021, 0.034, 0.055])  # rad a tick, of the goal's x, y and z
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_bus import baseline
 
+from benchmarks.one_process import baseline
 from brokk_min.__main__ import main
 from brokk_min.cli.options import find_plant
 from brokk_min.evaluation import baselines

@@ -8,8 +8,9 @@ import cantools
 import numpy as np
 import pytest
 from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, datatypes
-from helpers_bus import BASELINE, START, HoldingOperator, World, eventually, only, recording
+from helpers_bus import eventually
 
+from benchmarks.one_process import BASELINE, START, HoldingOperator, World, only, recording
 from brokk_min.can.canopen import (
     Frame,
     Nodes,

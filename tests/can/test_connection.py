@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import can
 import pytest
-from helpers_bus import raises
 
+from benchmarks.one_process import raises
 from brokk_min.can.canopen import Frame, OperatorInput
 from brokk_min.can.connection import Bus, open_bus
 

@@ -109,7 +109,7 @@ def test_log_for_fit__by_hand():
     with pytest.raises(ValueError, match=refusal):
         log_for_fit(machine, frames[:100])
     other = replace(machine, valve_frame_id=0x211)
-    with pytest.raises(ValueError, match=r"valve frames, 080 181 .* 185 211 .*, got none with 211$"):
+    with pytest.raises(ValueError, match=r"frames, 080 181 .* 185 211 .*, got none with 211$"):
         log_for_fit(other, frames)
 
 

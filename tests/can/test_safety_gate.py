@@ -1,6 +1,7 @@
 """The gate against a plain rewriting of its promises."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -182,21 +183,27 @@ def draw_state(machine, rng, counts):
     )
 
 
-@pytest.mark.parametrize(
-    ("machine", "seed", "dtype"), [(BROKK_170, 0, "f8"), (tight_machine(), 2, "f4")]
-)
-def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed, dtype):
-    """Commands are those of a PID or of a policy, in double or single precision."""
+@cache
+def promised(machine, seed, dtype):
+    """Random states and inputs, commands in double or single precision, and what is promised."""
     rng = np.random.default_rng(seed)
     inputs = draw_inputs(machine, rng)
     inputs = inputs._replace(command=inputs.command.astype(dtype))
     before = draw_state(machine, rng, inputs.counts)
-    state, frame = gate(machine, before, inputs, np.zeros(SHAPE))
     results = []
     for row in np.ndindex(SHAPE):
         given = [type(part)(*(x[row] for x in part)) for part in (before, inputs)]
         results.append(plain_gate(machine, *given, 0))
-    expected, frames = zip(*results, strict=True)
+    return before, inputs, *zip(*results, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("machine", "seed", "dtype"), [(BROKK_170, 0, "f8"), (tight_machine(), 2, "f4")]
+)
+def test_gate__is_what_its_promises_say_in_any_leading_shape(machine, seed, dtype):
+    """Commands are those of a PID or of a policy."""
+    before, inputs, expected, frames = promised(machine, seed, dtype)
+    state, frame = gate(machine, before, inputs, np.zeros(SHAPE))
     assert frame.dtype == np.uint8
     np.testing.assert_array_equal(frame[..., 6], checksum(np.delete(frame, 6, axis=-1)))
     sent = np.reshape(frames, (*SHAPE, 7))

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_bus import START, Recorder
 
+from benchmarks.one_process import START, Recorder
 from brokk_min.can.canopen import HEARTBEAT_PERIOD, WATCHDOG, Frame, valve_frame
 from brokk_min.can.simulated_machine import FaultyMachine, SimulatedMachine, parse_fault, start_pose
 from brokk_min.machine import BROKK_170
@@ -160,10 +160,7 @@ def test_faults__of_encoders_by_hand(kind):
         ("off", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
         ("stuck", [0, 0, 0, 0], ["valve frame with counter 2 after 2"]),
         ("garbage", [0, 0, 0, 0], [MALFORMED]),
-        ("wrong", [0, 0, 0, 0], [MALFORMED]),
-        ("slow", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
         ("delayed", [42, 43, 44, 45], []),
-        ("intermittent", [42, 0, 0, 0], ["no valve frame between two SYNCs"]),
         ("ok", [43, 44, 45, 46], []),
     ],
 )

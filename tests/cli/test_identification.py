@@ -5,9 +5,9 @@ import re
 
 import numpy as np
 import pytest
-from helpers_bus import ConstantCommand, HoldingOperator, World
 from helpers_cli import run
 
+from benchmarks.one_process import ConstantCommand, HoldingOperator, World
 from brokk_min.beyond.valve_nets import ValveNet
 from brokk_min.fit import Log, Recording
 from brokk_min.identification.logs import read_log, write_log

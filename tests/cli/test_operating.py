@@ -7,8 +7,9 @@ import threading
 
 import numpy as np
 import pytest
-from helpers_bus import BASELINE, HoldingOperator, Virtual, World, only
+from helpers_bus import Virtual
 
+from benchmarks.one_process import BASELINE, HoldingOperator, World, only
 from brokk_min.beyond.adaptation import valves
 from brokk_min.beyond.strong_pid import StrongPID
 from brokk_min.can.connection import open_bus

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_bus import Recorder
 from helpers_machines import coarse, small_net
 
+from benchmarks.one_process import Recorder
 from brokk_min.actuator import PLANT
 from brokk_min.evaluation import preliminary
 from brokk_min.kinematics import forward_kinematics, tool_position

@@ -27,8 +27,11 @@ OPTIONS = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in TINY
 ERROR = "velocity_error_mean"
 
 
-def test_robustness__is_over_seeds_for_them_and_over_starts_for_the_others(tmp_path, monkeypatch):
-    """By its command; each file is named by its fingerprint."""
+def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
+    """By its command, from poses that need no search; another training's policies are refused.
+
+    Robustness is over seeds for them and over starts for the others.
+    """
     monkeypatch.setattr(sweep, "side_by_side", one_by_one)
     monkeypatch.setattr(sweep, "evaluation_starts", lambda machine, num, *_: POSES[:num])
     for name in ("task_sequences", "axis_sequences"):
@@ -37,41 +40,6 @@ def test_robustness__is_over_seeds_for_them_and_over_starts_for_the_others(tmp_p
     monkeypatch.setattr(adaptive, "DRIVES", 2)
     net, out, beside = (tmp_path / name for name in ("net.npz", "out", "beside"))
     save_net(net, NET)
-    beside.mkdir()
-    for name in ("rl_paper", "rl_critic"):
-        save_policy(beside / POLICIES[name], random_policy("paper"))
-    given = pids(BROKK_170, NET)
-    write_gains(beside / "gains.json", given, gains_metadata(BROKK_170, NET))
-    command = f"sweep --actuator {net} --out {out} --seeds 2 --num-starts 2 --paper --critic"
-    assert run(f"{command} {OPTIONS} --robustness {beside}") == 0
-    written = json.loads((out / "robustness.json").read_text())
-    cases, files = written["robustness"], written["meta"]["files"]
-    names = ["seed_0.npz", "seed_1.npz", "policy_paper.npz", "policy_critic.npz", "gains.json"]
-    assert list(files) == names and files["seed_1.npz"] == digest(out / "seed_1.npz")
-    plain = ["rl", "rl_paper", "rl_critic", *given]
-    assert sorted(cases["nominal"]) == sorted(
-        f"{n}{s}" for n in plain for s in ("", "+cold", "+warm")
-    )
-    means = [
-        metrics.by_start(
-            metrics.evaluate(BROKK_170, {"rl": one}, SEQUENCES, POSES, 0)[0], "rl", "all", ERROR
-        )
-        for one in (load_policy(out / f"seed_{seed}.npz", BROKK_170) for seed in (0, 1))
-    ]
-    assert cases["nominal"]["rl"] == pytest.approx(metrics.mean_interval(np.mean(means, axis=1)))
-    pid = given["pid_by_hand"]
-    runs, _ = metrics.evaluate(BROKK_170, {"pid": pid}, SEQUENCES, POSES, 0, noise=0.1)
-    expected = metrics.mean_interval(metrics.by_start(runs, "pid", "all", ERROR))
-    assert cases["twice the sensor noise"]["pid_by_hand"] == pytest.approx(expected)
-
-
-def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
-    """By its command, from poses that need no search; another training's policies are refused."""
-    monkeypatch.setattr(sweep, "side_by_side", one_by_one)
-    monkeypatch.setattr(sweep, "evaluation_starts", lambda machine, num, *_: POSES[:num])
-    monkeypatch.setattr(sweep, "task_sequences", lambda machine: SEQUENCES)
-    net, out = tmp_path / "net.npz", tmp_path / "new"
-    save_net(net, NET)
     command = f"sweep --actuator {net} --out {out} --seeds 2 --seed 3 --num-starts 2"
     command = f"{command} --paper --critic {OPTIONS}"
     assert run(command) == 0
@@ -79,7 +47,12 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
     names = [f"seed_{n}.{end}" for n in (3, 4) for end in ("npz", "npz.csv")]
     assert sorted(path.name for path in out.iterdir()) == [*names, "seeds.json", "sweep.json"]
     times = [(out / name).stat().st_mtime_ns for name in names]
-    assert run(command) == 0
+    beside.mkdir()
+    for name in ("rl_paper", "rl_critic"):
+        save_policy(beside / POLICIES[name], random_policy("paper"))
+    given = pids(BROKK_170, NET)
+    write_gains(beside / "gains.json", given, gains_metadata(BROKK_170, NET))
+    assert run(f"{command} --robustness {beside}") == 0
     assert capsys.readouterr().out == printed
     assert [(out / name).stat().st_mtime_ns for name in names] == times
     policy = load_policy(out / "seed_4.npz", BROKK_170)
@@ -98,6 +71,20 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
     assert written["table"]["all"][ERROR] == pytest.approx(mean)
     assert written["table"]["along"] == written["table"]["all"]  # of x, y and z alone
     assert f"{ERROR:24} {metrics.interval_text(mean)}\n" in printed
+
+    varied = json.loads((out / "robustness.json").read_text())
+    cases, files = varied["robustness"], varied["meta"]["files"]
+    used = ["seed_3.npz", "seed_4.npz", "policy_paper.npz", "policy_critic.npz", "gains.json"]
+    assert list(files) == used and files["seed_4.npz"] == digest(out / "seed_4.npz")
+    plain = ["rl", "rl_paper", "rl_critic", *given]
+    every = sorted(f"{n}{s}" for n in plain for s in ("", "+cold", "+warm"))
+    assert sorted(cases["nominal"]) == every
+    assert cases["nominal"]["rl"] == pytest.approx(mean)
+    pid = given["pid_by_hand"]
+    runs, _ = metrics.evaluate(BROKK_170, {"pid": pid}, SEQUENCES, POSES, 0, noise=0.1)
+    expected = metrics.mean_interval(metrics.by_start(runs, "pid", "all", ERROR))
+    assert cases["twice the sensor noise"]["pid_by_hand"] == pytest.approx(expected)
+
     other = replace(RECIPE, task=replace(RECIPE.task, episode_s=0.8))
     told = r"seed_4\.npz: recipe: task: episode_s: expected 0\.8, got 20\.0"
     with pytest.raises(ValueError, match=told):

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -109,10 +110,9 @@ def test_inspect__names_recordings_in_which_angles_fall_under_positive_commands(
     assert "in all recordings or in none, got some in ['1', '4']" in told
 
 
-@pytest.mark.parametrize("excitation", [SINE, RICH])
-def test_inspect__finds_no_wrong_sign_in_sound_logs(excitation):
+def test_inspect__finds_no_wrong_sign_in_sound_logs():
     """Not even in short recordings, or where a joint creeps under commands that open no valve."""
-    for seed in range(2):
+    for seed, excitation in product(range(2), (SINE, RICH)):
         rng = np.random.default_rng(seed)
         assert not [*wrong_signs(inspect(collect(BROKK_170, 0.02, rng, PLANT, excitation)))]
     log = task_log(BROKK_170, 5, 8.0, np.random.default_rng(0))
@@ -250,12 +250,6 @@ def test_inspect__tells_steps_of_an_encoder_and_noise_from_another_motion():
         assert report.explained < 0.75 and report.coarse > 0.9
         assert report.step == pytest.approx(step, rel=0.6)
     assert boom(*SEVEN).coarse - boom(*SEVEN).explained < 0.05
-
-
-def test_inspect__names_the_joint_whose_commands_explain_a_motion():
-    swapped = [one._replace(u=one.u[:, ::-1]) for one in (record(name, holds()) for name in TRUE)]
-    reports = inspect(log_of(*swapped))
-    assert (reports["boom"].other, reports["arm"].other) == ("arm", "boom")
 
 
 def test_inspect__knows_commands_at_rest_and_switches():

@@ -79,15 +79,6 @@ def test_read_ros__puts_together_what_several_nodes_send_and_says_so(tmp_path):
     assert "bag: row 2: expected motion of q_boom, got a jump to nan" in log.warnings[1]
 
 
-def test_read_ros__says_which_order_it_took_of_nodes_with_other_ones(tmp_path):
-    messages = [(99.9, "/valves", multi_array([0.5, -0.5]))]
-    for k in range(20):
-        for names in (["boom", "arm"], ["arm", "boom"]):
-            messages.append((100 + k / 20, "/joint_states", joint_state(names, [0.1, 0.1])))
-    _, warnings = read_ros(record(tmp_path / "bag", messages), "/joint_states", "/valves")
-    assert warnings[0] == "/valves: expected one order of the joints, took ['boom', 'arm']"
-
-
 def test_read_ros__leaves_out_empty_messages_and_stamps_that_nobody_has_set(tmp_path):
     """A driver publishes before its first read; velocities are no angles."""
     messages = [(99.9, "/valves", multi_array([0.5]))]

@@ -1,22 +1,21 @@
 """The 20 Hz loop against the plant, on a simulated bus with an injected clock."""
 
 import os
+import re
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-from helpers_bus import START, ConstantCommand, HoldingOperator, World, raises, recording
-from helpers_faults import COMMAND, FAULTS, NOT_FOUND, fail, flood, foreign, measure, stall
 from helpers_machines import DRIVEN, obedient_net, pids
 
+from benchmarks.faults import COMMAND, FAULTS, NOT_FOUND, fail, flood, measure, stall
+from benchmarks.one_process import START, ConstantCommand, HoldingOperator, World, raises, recording
 from brokk_min._files import SHIPPED
 from brokk_min.can import simulated_machine
 from brokk_min.can.canopen import valve_frame
 from brokk_min.can.operator_input import Script
 from brokk_min.env import reward
-from brokk_min.evaluation.baselines import BY_HAND, STRONGEST
+from brokk_min.evaluation.baselines import STRONGEST
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import axis_sequences
 from brokk_min.kinematics import forward_kinematics, tool_velocity
@@ -34,15 +33,6 @@ def started():
 world = pytest.fixture(started)
 
 
-def test_import__loads_no_library_that_is_not_needed():
-    """On the machine, an import of torch costs two seconds and 200 MB."""
-    heavy = "can pygame torch onnx matplotlib gymnasium scipy"
-    modules = "brokk_min.hw, brokk_min.can.simulated_machine, brokk_min.learning.policy"
-    code = f"import sys, {modules}; print({set(heavy.split())} & {{*sys.modules}})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
-
-
 # --- driving -------------------------------------------------------------------------------------
 
 
@@ -52,9 +42,7 @@ def controller_of(name):
     return pids(BROKK_170, obedient_net(BROKK_170))[name]
 
 
-@pytest.mark.parametrize(
-    ("axis", "name"), [(2, BY_HAND), (0, STRONGEST), (1, "rl"), (0, "rl_paper")]
-)
+@pytest.mark.parametrize(("axis", "name"), [(0, STRONGEST), (1, "rl")])
 def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     """Within 0.2 %, with 2 ms of bus and machine between SYNC and valve frame."""
     goals = axis_sequences(BROKK_170)[axis].goals[:280]  # 14 s
@@ -119,11 +107,11 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later():
 # --- faults --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", {re.sub("^q[1-5]", "q", name): name for name in FAULTS}.values())
 def test_tick__ends_neutral_and_latched_within_175_ms_of_every_fault(name):
     """By the plant's own record, whenever in a tick it comes, though the operator holds on.
 
-    `python -m benchmarks.faults` measures each fault 20 times.
+    Of encoders it is that of q5; `python -m benchmarks.faults` measures all, and each 20 times.
     """
     phase = (0.0005, 0.0215, 0.0485)[list(FAULTS).index(name) % 3]
     cause, words = FAULTS[name]
@@ -143,9 +131,7 @@ def closes_within(world, begun, seconds):
     return not m[times > begun + seconds].any()
 
 
-@pytest.mark.parametrize(
-    ("node", "counts", "bound"), [(1, 80, 0.14), (3, 40, 0.19), (4, -40, 0.14), (3, 16, 1.6)]
-)
+@pytest.mark.parametrize(("node", "counts", "bound"), [(3, 40, 0.19), (4, -40, 0.14), (3, 16, 1.6)])
 def test_tick__finds_a_frozen_encoder_at_small_commands_too(node, counts, bound, world):
     """The table of docs/hardware.md: the smaller the command, the longer it takes."""
     world.controller.m = counts * (np.arange(1, 6) == node)
@@ -193,15 +179,6 @@ def test_tick__finds_positions_later_than_20_ms(late, found, world, monkeypatch)
     world.run(1.0)
     assert world.drive.reason == found * "fault: q3: silent"
     assert closes_within(world, begun, 0.175) == bool(found)
-
-
-def test_tick__takes_the_answers_after_a_position_before_sync(world):
-    """It is a fault of one tick; in the next the answers are heard again."""
-    world.run(0.6)
-    foreign(world, 0x185, bytes(4))
-    world.run(0.2)
-    assert world.drive.reason == "fault: q5: position before SYNC"
-    assert world.drive.gate.active_fault == ""
 
 
 def test_tick__leaves_a_fault_by_a_new_edge_only(world):

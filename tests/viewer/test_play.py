@@ -5,10 +5,11 @@ from collections import Counter
 import numpy as np
 import pygame
 import pytest
-from helpers_bus import BASELINE, Virtual
+from helpers_bus import Virtual
 from helpers_cli import run
 from pygame._sdl2 import controller
 
+from benchmarks.one_process import BASELINE
 from brokk_min.evaluation.rollout import TITLES
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170

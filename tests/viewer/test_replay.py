@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from helpers_bus import BASELINE, HoldingOperator, World
 from helpers_cli import run
 from PIL import Image, ImageSequence
 
+from benchmarks.one_process import BASELINE, HoldingOperator, World
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.machine import BROKK_170
 from brokk_min.viewer import replay
