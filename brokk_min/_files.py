@@ -19,6 +19,7 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from brokk_min.machine import require
 
@@ -153,6 +154,12 @@ def expect_same(place: Path | str, found: Mapping[str, Any], wanted: Mapping[str
         require(got == value, f"{place}: {name}", brief(value), brief(got))
 
 
+def progress(lines: Iterable[Any], path: Path) -> Iterable[Any]:
+    """The lines of a file, with a bar if they take longer than a second."""
+    title = f"read {Path(path).name}"
+    return tqdm(lines, title, leave=False, disable=None, unit="line", unit_scale=True, delay=1.0)
+
+
 def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
     """The cells of a CSV by column, see `numbers`; ValueError: no such columns, or a short row.
 
@@ -162,7 +169,8 @@ def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
         with open(path, newline="", encoding="utf-8-sig") as file:
             semicolons = ";" in file.readline()
             file.seek(0)
-            header, *rows = csv.reader(file, delimiter=";" if semicolons else ",", strict=True)
+            cells = csv.reader(file, delimiter=";" if semicolons else ",", strict=True)
+            header, *rows = progress(cells, path)
         if semicolons:
             rows = [[cell.replace(",", ".") for cell in row] for row in rows]
         names = [name.strip() for name in header]

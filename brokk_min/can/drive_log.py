@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from brokk_min._files import brief, expected, require_package
+from brokk_min._files import brief, expected, progress, require_package
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame, Nodes
 from brokk_min.can.connection import plain_frame
@@ -51,7 +51,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
         return
     strange, before, falls = "", 0.0, 0
     with expected(path, "a candump log"), open(path, encoding="utf-8-sig") as file:
-        for row, line in enumerate(file, 1):
+        for row, line in enumerate(progress(file, path), 1):
             wanted = "(time) bus identifier#data, as candump -l writes"
             wanted += " (tables have names in .csv or .npz)" if row == 1 else ""
             if match := LINE.fullmatch(line):
