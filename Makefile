@@ -20,7 +20,7 @@ test: lint check
 
 check: .venv/installed-dev
 	$(RUN) coverage erase
-	$(RUN) coverage run -m pytest --numprocesses 2 --dist loadfile
+	$(RUN) coverage run -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 	$(RUN) coverage combine --quiet
 	$(RUN) coverage report
 	$(RUN) coverage report --fail-under=100 \

@@ -17,6 +17,14 @@ settings.register_profile("deep", settings.get_profile("dev"), max_examples=1000
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
+LONGEST = ("test_mutants.py", "test_reproduce.py", "test_adaptation.py", "test_chain.py")
+
+
+def pytest_collection_modifyitems(items):
+    """The longest files first: else one of two processes waits for the other at the end."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
     """Small nets are fitted fastest on one thread."""

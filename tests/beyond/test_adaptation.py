@@ -15,7 +15,7 @@ from brokk_min.beyond import adaptation
 from brokk_min.beyond.adaptation import Adaptive, Known, adapt, unknown, valves
 from brokk_min.evaluation import adaptive, sequences
 from brokk_min.evaluation.reproduce import variations
-from brokk_min.evaluation.rollout import rollout
+from brokk_min.evaluation.rollout import Together, rollout
 from brokk_min.identification.validation import task_log
 from brokk_min.identification.valve_report import KEPT, describe, from_log, load_known, save_known
 from brokk_min.learning.policy import load_policy
@@ -47,7 +47,10 @@ def error_of(truth, controller):
 def driven(name):
     """What our agent learns in the drives, with its error as it learns and without."""
     learner = Adaptive(POLICY, NET, BROKK_170)
-    return Result(error_of(VARIED[name], learner), error_of(VARIED[name], POLICY), learner.known)
+    both = Together([learner, POLICY])
+    trace = rollout(VARIED[name], both, *DRIVES, 0.05, np.random.default_rng(0), copies=2)
+    errors = np.linalg.norm(np.tile(DRIVES[1], (2, 1)) - trace.v_tool, axis=-1)
+    return Result(*errors.reshape(len(errors), 2, -1).mean(axis=(0, 2)), learner.known)
 
 
 @pytest.mark.parametrize(

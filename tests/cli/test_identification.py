@@ -79,7 +79,7 @@ def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys)
     short.write_text("".join(f"{line}\n" for line in table.splitlines()[:10]))
     assert run(f"fit {TINY}", tmp_path / "sound.csv", "--test", short, "--out", tmp_path / "n.npz")
     told = capsys.readouterr()
-    assert "above 14 samples to score on, got [9]" in told.err and "warning" not in told.out
+    assert "above 14 samples to score on, got [2]" in told.err and "warning" not in told.out
     assert not (tmp_path / "n.npz").exists()
     assert run("inspect", log, log) == 2 and "each once" in capsys.readouterr().err
     assert run("inspect", log) == 0
