@@ -79,11 +79,13 @@ def test_train__has_its_name_for_itself_while_it_runs(tmp_path, monkeypatch, cap
     prepare, status = checkpoint.prepare, []
 
     def meanwhile(*arguments):
-        monkeypatch.undo()
+        monkeypatch.setattr(checkpoint, "prepare", prepare)
         status.append(run(f"{line} --seed 2"))
         return prepare(*arguments)
 
     monkeypatch.setattr(checkpoint, "prepare", meanwhile)
+    monkeypatch.setattr(sequences, "axis_sequences", lambda machine: short_axes(10))
+    monkeypatch.setattr(baselines, "LOOK_SECONDS", 0.5)
     assert (run(line), status) == (0, [2])
     assert "p.npz.checkpoint: expected --resume or no checkpoint" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"net.npz", "p.npz", "p.npz.csv"}
