@@ -76,7 +76,7 @@ def test_train__has_its_name_for_itself_while_it_runs(tmp_path, monkeypatch, cap
     """A second training of the name is refused, and may begin once the first one has ended."""
     save_net(tmp_path / "net.npz", small_net(BROKK_170, np.random.default_rng(0)))
     line = f"train --actuator {tmp_path}/net.npz --out {tmp_path}/p.npz {SMALL}"
-    prepare, status = checkpoint.prepare, []
+    prepare, status, short = checkpoint.prepare, [], short_axes(10)
 
     def meanwhile(*arguments):
         monkeypatch.setattr(checkpoint, "prepare", prepare)
@@ -84,7 +84,7 @@ def test_train__has_its_name_for_itself_while_it_runs(tmp_path, monkeypatch, cap
         return prepare(*arguments)
 
     monkeypatch.setattr(checkpoint, "prepare", meanwhile)
-    monkeypatch.setattr(sequences, "axis_sequences", lambda machine: short_axes(10))
+    monkeypatch.setattr(sequences, "axis_sequences", lambda machine: short)
     monkeypatch.setattr(baselines, "LOOK_SECONDS", 0.5)
     assert (run(line), status) == (0, [2])
     assert "p.npz.checkpoint: expected --resume or no checkpoint" in capsys.readouterr().err
