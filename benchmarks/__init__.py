@@ -1,4 +1,7 @@
-"""Speed and ablations; run them as `python -m benchmarks.<name>` from the project's root."""
+"""Speed and ablations; run them as `python -m benchmarks.<name>` from the project's root.
+
+`one_process` is a simulated machine for them and for tests.
+"""
 
 import os
 

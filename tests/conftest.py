@@ -1,4 +1,7 @@
-"""Hypothesis profiles: `ci` repeats itself bit for bit, `dev` explores, `deep` for long."""
+"""Order and threads of tests; profiles of Hypothesis.
+
+Of these `ci` repeats itself bit for bit, `dev` explores, and `deep` does so for long.
+"""
 
 import os
 

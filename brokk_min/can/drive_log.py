@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from brokk_min._files import brief, expected, progress, require_package
+from brokk_min._files import brief, expected, require_package, with_bar
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame, Nodes
 from brokk_min.can.connection import plain_frame
@@ -51,7 +51,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
         return
     strange, before, falls = "", 0.0, 0
     with expected(path, "a candump log"), open(path, encoding="utf-8-sig") as file:
-        for row, line in enumerate(progress(file, path), 1):
+        for row, line in enumerate(with_bar(file), 1):
             wanted = "(time) bus identifier#data, as candump -l writes"
             wanted += " (tables have names in .csv or .npz)" if row == 1 else ""
             if match := LINE.fullmatch(line):
@@ -124,7 +124,7 @@ def identifiers(of: Iterable[int]) -> str:
 def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     """Commands and angles while driving, as recordings for `fit`; a gap or jump starts a new one.
 
-    ValueError: frames of the machine that never come, or nothing was driven for long enough.
+    ValueError: some of the machine's frames never come, or too little was driven in a row.
     """
     missing = {canopen.SYNC, machine.valve_frame_id, *Nodes(machine).position_index}
     wanted = f"SYNC, positions and valve frames, {identifiers(missing)} (--machine)"

@@ -30,7 +30,7 @@ class Evaluate(Command):
     policy: Path | None = None  # Policy that `train` wrote; by default those of the package.
     commands: Path | None = None  # Velocity sequences, CSV: sequence,time,vx,vy,vz [s, m/s].
     starts: Path | None = None  # Start poses, CSV: one column per joint [rad].
-    plant: str = "analytic"  # What moves: analytic, net (of the policy), or FILE.py:NAME.
+    plant: str = "analytic"  # What moves: analytic, net (of the policy), FILE.npz, FILE.py:NAME.
     controller: str = ""  # Also one of your own: FILE.py:NAME, a function of machine and nets.
     json: Path | None = None  # Also write all runs here.
     save_gains: Path | None = None  # Tune the PIDs, even if there are gains; write them here.

@@ -30,7 +30,7 @@ class Collect(Command):
     out: Path  # Log to write, .csv or .npz.
     hours: float = 1.0  # Driving time of each actuator [h].
     excitation: Literal["sine", "rich"] = "rich"  # The paper's sines; or steps and holds, too.
-    plant: str = "analytic"  # What moves: the analytic plant, or FILE.py:NAME.
+    plant: str = "analytic"  # What moves: the analytic plant, nets (.npz), FILE.py:NAME.
     seed: int = 0  # Of the commands.
 
     def __call__(self, machine: Machine) -> None:
@@ -140,7 +140,8 @@ class Fit(ReadsLogs):
             every = log._replace(recordings=(*log.recordings, *test.recordings))
         else:
             every, (log, test) = log, logs.split(log)
-        validation.scored_steps(test, machine.history)  # now, not after the fit
+        with expected((self.test or self.logs)[0], "a log to score on"):
+            validation.scored_steps(test, machine.history)  # now, not after the fit
         reports = inspection.inspect(every, known)
         for wrong in (*inspection.wrong_signs(reports), *inspection.mixed_up(reports)):
             raise ValueError(f"{self.logs[0]}: {wrong}")

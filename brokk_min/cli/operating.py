@@ -41,7 +41,7 @@ class Simulate(Command):
 
     interface: str  # python-can's name of the bus, udp_multicast for a try without hardware.
     channel: str  # Channel of the interface, for udp_multicast 239.74.163.2.
-    plant: str = "analytic"  # What moves, or FILE.py:NAME, stepped once a tick.
+    plant: str = "analytic"  # What moves, nets (.npz) or FILE.py:NAME, stepped once a tick.
     fault: tuple[str, ...] = ()  # [JOINT:]KIND@SECONDS, as q3:stuck@5 ok@8; see docs/hardware.md.
 
     def __call__(self, machine: Machine) -> None:
@@ -183,7 +183,7 @@ class Play(Command):
     """
 
     policy: Path | None = None  # Policy that `train` wrote; PIDs: gains.json beside it, or ours.
-    plant: str = "analytic"  # What moves, or FILE.py:NAME.
+    plant: str = "analytic"  # What moves, nets (.npz) or FILE.py:NAME.
     adapt: bool = False  # The controllers learn how the valves differ from those of the logs.
 
     def __call__(self, machine: Machine) -> None:

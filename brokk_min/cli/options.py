@@ -16,6 +16,7 @@ import tyro
 from brokk_min._files import NEW, SHIPPED, brief, expected
 from brokk_min.actuator import PLANT, ActuatorNet, Plant, stands_in
 from brokk_min.evaluation.baselines import Baselines, read_gains
+from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX, Array, Controller, Machine, Measured, require
 
@@ -99,7 +100,7 @@ class Command:
 def load_object(option: str, name: str) -> Any:
     """The object NAME of `FILE.py:NAME`; the file is run, as `python FILE.py` would."""
     path, _, symbol = name.rpartition(":")
-    usual = {"--plant": "analytic", "--controller": "a name of --help"}
+    usual = {"--plant": "analytic, nets (.npz)", "--controller": "a name of --help"}
     known = usual.get(option, BROKK_170.name)
     check(path.endswith(".py"), option, f"{known} or FILE.py:NAME", name)
     folder, before = str(Path(path).resolve().parent), Path.cwd()
@@ -119,14 +120,17 @@ def load_object(option: str, name: str) -> Any:
 
 
 def find_plant(name: str, machine: Machine) -> Plant:
-    """The analytic plant, or one of a file, once each joint has moved up for two seconds.
+    """The analytic plant, nets of a file, or a plant of one's own.
 
-    ValueError: no plant, or one that reports degrees, stands still or obeys the wrong way.
+    Of this each joint has moved up for two seconds. ValueError: no plant or nets of the machine, or
+    a plant that reports degrees, stands still or obeys the wrong way.
     """
+    if name.endswith(".npz"):
+        return load_net(Path(name), machine)
     if name == "analytic":
         if stands_in(machine):
             got = "a machine without hydraulics: those of the analytic plant are made up"
-            warning = f"warning: --plant: expected FILE.py:NAME, or net of evaluate, got {got}"
+            warning = f"warning: --plant: expected nets (.npz) or FILE.py:NAME, got {got}"
             print(warning, file=sys.stderr)
         return PLANT
     plant = OwnPlant(name, load_object("--plant", name))

@@ -78,6 +78,8 @@ class Train(Training):
         from brokk_min.learning.checkpoint import train_policy
 
         self.writes(self.out, None if self.resume else Path(f"{self.out}.csv"))
+        commands = sequences.axis_sequences(machine)
+        starts = sequences.evaluation_starts(machine, STARTS, commands, 0)  # can it follow any?
         checkpoint = Path(f"{self.out}.checkpoint")
         try:
             checkpoint.touch(exist_ok=self.resume)  # the name is taken, for other trainings
@@ -93,8 +95,6 @@ class Train(Training):
             if checkpoint.exists() and not checkpoint.stat().st_size:  # nothing is learned yet
                 checkpoint.unlink()
         if machine == BROKK_170:
-            commands = sequences.axis_sequences(machine)
-            starts = sequences.evaluation_starts(machine, STARTS, commands, 0)
             rivals: dict[str, Controller] = {policy.name: policy, **pids}
             runs, _ = metrics.evaluate(machine, rivals, commands, starts, self.seed)
             print(table(runs))

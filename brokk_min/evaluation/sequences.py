@@ -162,6 +162,8 @@ def feasible(machine: Machine, start: Array, goals: Array) -> NDArray[np.bool_]:
     opening = valve_opening(limit, machine.dead_zones)  # up, and down, which is negative
     up, down = 0.9 * opening * cylinder_speeds(machine).T  # of the cylinders [m/s], (n,) each
     for v_goal in goals:
+        if not len(rows):
+            break
         frames = forward_kinematics(machine, q)
         off = p_goal - tool_position(frames)
         fits = np.linalg.norm(off, axis=-1) < 0.02

@@ -18,7 +18,8 @@ from brokk_min.identification.ros_logs import COMMAND_TIME, read_ros
 from brokk_min.machine import Array, require
 
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
-COMMAND_UNITS = {100: "percent or :0.00787", 127: "0.00787", 255: "UNIT", 1000: "permille"}  # up to
+# of commands, by the largest number in them
+COMMAND_UNITS = {100: "percent or :0.00787", 127: "0.00787", 255: "UNIT", 1000: "permille"}
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # beside folders of ROS
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands

@@ -355,12 +355,13 @@ def one_size(u: Array) -> bool:
 def contradicts(motion: Motion, model: Model) -> bool:
     """Does a joint move against what the model expects of its commands?
 
-    Where it expects no motion, noise moves either way.
+    Where it expects no more than `MOVED`, noise decides the sign.
     """
     expected = expected_velocity(motion, model)
     velocity = motion.velocity - motion.velocity.mean()
     size = np.linalg.norm(expected) * np.linalg.norm(velocity)
-    clear = np.ptp(np.cumsum(expected)) / motion.rate > MOVED
+    path = np.append(0.0, np.cumsum(expected)) / motion.rate
+    clear = np.ptp(path) > MOVED
     return bool(clear and expected @ velocity < -AGAINST * size)
 
 

@@ -50,7 +50,7 @@ def scored_steps(log: Log, history: int) -> NDArray[np.intp]:
     """Samples from which one step can be scored; ValueError: there is none."""
     samples = join_recordings(log)
     starts = samples.starts(history, 1, 1)
-    wanted = f"a recording above {history + 1} samples to score on"
+    wanted = f"a recording of more than {history + 1} samples to score on"
     require(len(starts) > 0, "log", wanted, samples.lengths[:9])
     return starts
 

@@ -183,7 +183,7 @@ def draw_state(machine, rng, counts):
     )
 
 
-@cache
+@cache  # planted errors of this test are in the gate, which is not called here
 def promised(machine, seed, dtype):
     """Random states and inputs, commands in double or single precision, and what is promised."""
     rng = np.random.default_rng(seed)

@@ -77,9 +77,11 @@ def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys)
     assert "expected motion by u_arm, got motion by u_boom" in capsys.readouterr().err
     short = tmp_path / "short.csv"
     short.write_text("".join(f"{line}\n" for line in table.splitlines()[:10]))
-    assert run(f"fit {TINY}", tmp_path / "sound.csv", "--test", short, "--out", tmp_path / "n.npz")
+    files = [tmp_path / "sound.csv", "--test", short, "--out", tmp_path / "n.npz"]
+    assert run(f"fit {TINY}", *files) == 1
     told = capsys.readouterr()
-    assert "above 14 samples to score on, got [2]" in told.err and "warning" not in told.out
+    wanted = "short.csv: log: expected a recording of more than 14 samples to score on, got [2]"
+    assert wanted in told.err and "warning" not in told.out
     assert not (tmp_path / "n.npz").exists()
     assert run("inspect", log, log) == 2 and "each once" in capsys.readouterr().err
     assert run("inspect", log) == 0

@@ -5,9 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_machines import small_net
 
 from brokk_min.actuator import PLANT
+from brokk_min.can.canopen import Frame
+from brokk_min.can.simulated_machine import SimulatedMachine
 from brokk_min.cli.options import Command, WrongUse, default_policy, find_plant
+from brokk_min.identification.net_file import save_net
 from brokk_min.machine import BROKK_170
 
 FILE = """
@@ -128,6 +132,20 @@ def test_find_plant__tries_each_joint(file):
     with pytest.raises(ValueError, match=r":ENDS: expected a plant .* got SystemExit\(0\)"):
         for _ in range(21):
             state = plant.step(BROKK_170, state, 0 * q)
+
+
+def test_find_plant__takes_nets_of_the_machine(tmp_path):
+    path = tmp_path / "n.npz"
+    save_net(path, small_net(BROKK_170, np.random.default_rng(0)))
+    plant, u = find_plant(str(path), BROKK_170), np.full(5, 0.6)
+    machine = SimulatedMachine(BROKK_170, BROKK_170.q_start, 0.0, plant)
+    machine.u = u
+    expected = plant.step(BROKK_170, machine.state, u).q
+    assert (expected != BROKK_170.q_start).tolist() == [True, False, True, True, True]
+    machine.receive(Frame(0.05, 0x080, b""))  # a tick
+    assert np.array_equal(machine.state.q, expected)
+    with pytest.raises(ValueError, match=r"n\.npz: actuator: expected nets with name, rate"):
+        find_plant(str(path), replace(BROKK_170, name="digger"))
 
 
 def test_default_policy__is_the_packages_if_it_has_one():

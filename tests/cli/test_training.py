@@ -91,6 +91,16 @@ def test_train__has_its_name_for_itself_while_it_runs(tmp_path, monkeypatch, cap
     assert {path.name for path in tmp_path.iterdir()} == {"net.npz", "p.npz", "p.npz.csv"}
 
 
+def test_train__refuses_goals_that_the_machine_cannot_follow(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sequences, "STARTS_OF", 20)
+    monkeypatch.chdir(tmp_path)
+    text = "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
+    Path("m.py").write_text(f"{text}FAST = replace(BROKK_170, tool_speed=3.0)\n")
+    assert run("train --machine m.py:FAST --actuator missing.npz") == 1
+    assert "got 0: is tool_speed too large?" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["m.py"]
+
+
 def test_porting_page__names_all_settings_and_no_others():
     """In the first column of its table of names."""
     page = (ROOT / "docs" / "porting.md").read_text(encoding="utf-8")

@@ -238,6 +238,10 @@ def test_inspect__names_short_stalls_and_a_joint_that_sags():
     noisy = nearly._replace(name="noisy", q=-0.6 * nearly.q)
     reports = inspect(log_of(*(record("boom", u) for u in SEVEN), noisy))
     assert reports["boom"].opposite == []
+    clear = record("boom", np.repeat([0.0, 0.18, 0.0], [10, 10, 20]))  # by 15 mrad
+    fallen = clear._replace(name="fallen", q=-0.6 * clear.q)
+    reports = inspect(log_of(*(record("boom", u) for u in SEVEN), fallen))
+    assert reports["boom"].opposite == ["fallen"]
 
 
 def test_inspect__tells_steps_of_an_encoder_and_noise_from_another_motion():

@@ -50,7 +50,7 @@ def test_score__refuses_a_log_of_another_rate_or_without_a_whole_history():
     net = constant_net([0.2], ("a",))
     with pytest.raises(ValueError, match=r"rate: expected 20\.0, got 10\.0"):
         score(net, Log(("a",), (line("x", 0.0, 0.1, 40),), 10.0))
-    with pytest.raises(ValueError, match=r"above 14 samples to score on, got \[14\]"):
+    with pytest.raises(ValueError, match=r"of more than 14 samples to score on, got \[14\]"):
         score(net, Log(("a",), (line("x", 0.0, 0.1, 14),)))
 
 

@@ -1,7 +1,6 @@
 """The 20 Hz loop against the plant, on a simulated bus with an injected clock."""
 
 import os
-import re
 import signal
 
 import numpy as np
@@ -42,7 +41,7 @@ def controller_of(name):
     return pids(BROKK_170, obedient_net(BROKK_170))[name]
 
 
-@pytest.mark.parametrize(("axis", "name"), [(0, STRONGEST), (1, "rl")])
+@pytest.mark.parametrize(("axis", "name"), [(0, STRONGEST), (1, "rl"), (2, "rl_paper")])
 def test_run__earns_over_the_bus_the_reward_of_evaluate(axis, name):
     """Within 0.2 %, with 2 ms of bus and machine between SYNC and valve frame."""
     goals = axis_sequences(BROKK_170)[axis].goals[:280]  # 14 s
@@ -107,11 +106,15 @@ def test_tick__is_silent_until_armed_and_opens_valves_a_tick_later():
 # --- faults --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", {re.sub("^q[1-5]", "q", name): name for name in FAULTS}.values())
+# each kind of encoder fault at about two joints, at different moments of a tick
+SOME = [name for i, name in enumerate(FAULTS) if not name.startswith("q") or i % 5 < 2]
+
+
+@pytest.mark.parametrize("name", SOME)
 def test_tick__ends_neutral_and_latched_within_175_ms_of_every_fault(name):
     """By the plant's own record, whenever in a tick it comes, though the operator holds on.
 
-    Of encoders it is that of q5; `python -m benchmarks.faults` measures all, and each 20 times.
+    `python -m benchmarks.faults` measures all encoders, and each kind of fault 20 times.
     """
     phase = (0.0005, 0.0215, 0.0485)[list(FAULTS).index(name) % 3]
     cause, words = FAULTS[name]
