@@ -10,7 +10,7 @@ import pytest
 from benchmarks.one_process import baseline
 from brokk_min.__main__ import main
 from brokk_min.cli.options import find_plant
-from brokk_min.evaluation import baselines
+from brokk_min.evaluation import baselines, sequences
 from brokk_min.evaluation.rollout import rollout
 from brokk_min.kinematics import forward_kinematics, tool_position
 from examples.mini_excavator import MINI_EXCAVATOR
@@ -78,6 +78,7 @@ def test_porting_page__has_commands_that_run_one_after_the_other(folder, monkeyp
     """All but the last two, which need a bus and an operator."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(baselines, "EFFORT", (1, 1, 1.0))
+    monkeypatch.setattr(sequences, "STARTS_OF", 400)
     commands = [shlex.split(line) for line in re.findall(r"^brokk-min (.*)$", PAGE, re.M)]
     names = " ".join(words[0] for words in commands)
     assert names == "collect inspect inspect fit train evaluate machine drive"
