@@ -81,6 +81,9 @@ class Train(Training):
         commands = sequences.axis_sequences(machine)
         starts = sequences.evaluation_starts(machine, STARTS, commands, 0)  # can it follow any?
         checkpoint = Path(f"{self.out}.checkpoint")
+        empty = checkpoint.exists() and not checkpoint.stat().st_size
+        got = "an empty checkpoint: one runs, or was killed before its first (then remove the file)"
+        check(not empty, str(checkpoint), "no training with this name", got)
         try:
             checkpoint.touch(exist_ok=self.resume)  # the name is taken, for other trainings
         except FileExistsError:

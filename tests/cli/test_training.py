@@ -61,12 +61,15 @@ def test_train__has_its_settings_from_the_line(
 
 
 def test_train__goes_on_only_if_it_is_told_to(tmp_path, capsys):
-    (tmp_path / "p.npz.checkpoint").touch()
+    (tmp_path / "p.npz.checkpoint").write_text("of a training")
     line = f"train --actuator missing.npz --out {tmp_path}/p.npz"
     assert run(line) == 2
     assert "checkpoint: expected --resume or no checkpoint, got one" in capsys.readouterr().err
     assert run(f"{line} --resume") == 1
     assert "missing.npz: no such file" in capsys.readouterr().err
+    (tmp_path / "r.npz.checkpoint").touch()
+    assert run(f"train --out {tmp_path}/r.npz --resume") == 2
+    assert "expected no training with this name, got an empty checkpoint" in capsys.readouterr().err
     (tmp_path / "q.npz.csv").mkdir()
     assert run(f"train --out {tmp_path}/q.npz --force") == 2
     assert "q.npz.csv: expected a file in an existing" in capsys.readouterr().err
@@ -87,7 +90,7 @@ def test_train__has_its_name_for_itself_while_it_runs(tmp_path, monkeypatch, cap
     monkeypatch.setattr(sequences, "axis_sequences", lambda machine: short)
     monkeypatch.setattr(baselines, "LOOK_SECONDS", 0.5)
     assert (run(line), status) == (0, [2])
-    assert "p.npz.checkpoint: expected --resume or no checkpoint" in capsys.readouterr().err
+    assert "p.npz.checkpoint: expected no training with this name" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"net.npz", "p.npz", "p.npz.csv"}
 
 
