@@ -25,7 +25,7 @@ from brokk_min.identification.net_file import fingerprint
 from brokk_min.learning.gym_env import TaskVectorEnv
 from brokk_min.learning.policy import INTERFACES, Policy, contract, save_policy
 from brokk_min.learning.recipes import Recipe
-from brokk_min.machine import Machine
+from brokk_min.machine import Machine, require
 from brokk_min.ppo import Agent, Checkpoint, Rollout
 
 EVERY = 50  # updates between two checkpoints
@@ -67,8 +67,8 @@ def train_policy(
     The same `seed` gives the same bits on the same computer. `<out>.checkpoint` and the curve
     `<out>.csv` lie next to the policy. Where a checkpoint exists, the training goes on from it, and
     the result is the same as without the break. Ten times what `look` says of the policy without
-    its exploration is printed. ValueError: a checkpoint of another training, or a loss that is not
-    finite.
+    its exploration is printed. ValueError: a checkpoint of another training, one that another goes
+    on with, or a loss that is not finite.
     """
     about: dict[str, Any] = {"contract": contract(machine, recipe.interface)}
     about |= {"actuator": fingerprint(net), "seed": seed, "recipe": asdict(recipe)}
@@ -78,12 +78,14 @@ def train_policy(
     rows: Curve = []
     if checkpoint.exists() and checkpoint.stat().st_size:
         start, rows = load(checkpoint, about, env, start)
+    ours = written(checkpoint)
 
     def policy_of(agent: Agent) -> Policy:
         training = about | {"made_with": made_with()}
         return Policy(machine, training, actor_weights(agent), net, recipe.interface)
 
     def on_update(now: Checkpoint, rollout: Rollout, metrics: dict[str, float]) -> None:
+        nonlocal ours
         error = float(np.mean([info["velocity_error"].mean() for info in rollout.infos]))
         rows.append({"global_step": now.global_step, **metrics, "charts/velocity_error": error})
         bar.update(now.global_step - bar.n)
@@ -91,8 +93,11 @@ def train_policy(
         if look and now.update % max(1, updates // LOOKS) == 0:
             bar.write(f"{now.global_step:,} steps: {look(policy_of(now.agent))}")
         if now.update % EVERY == 0 or now.global_step >= config.total_steps:
+            alone = written(checkpoint) in (0, ours)
+            require(alone, str(checkpoint), "one training with this name", "another, which goes on")
             write_csv(Path(f"{out}.csv"), rows[0], [row.values() for row in rows])
             save(checkpoint, about, env, now, rows)
+            ours = written(checkpoint)
 
     size: dict[str, Any] = {"total": config.total_steps, "initial": start.global_step}
     with tqdm(desc="train", **size, unit="step", unit_scale=True, disable=None) as bar:
@@ -101,6 +106,11 @@ def train_policy(
     save_policy(out, policy)
     checkpoint.unlink(missing_ok=True)
     return policy
+
+
+def written(path: Path) -> int:
+    """When a file was written [ns]; 0: there is none."""
+    return path.stat().st_mtime_ns if path.exists() else 0
 
 
 def prepare(

@@ -100,6 +100,19 @@ def test_train_policy__goes_on_after_an_interruption_to_the_same_files(tmp_path,
     assert all(np.isfinite(column.astype(float)).all() for column in curve.values())
 
 
+def test_train_policy__stops_where_another_training_goes_on_with_its_checkpoint(tmp_path):
+    path, checkpoint = tmp_path / "p.npz", tmp_path / "p.npz.checkpoint"
+
+    def look(policy):
+        if checkpoint.exists():
+            os.utime(checkpoint, (1, 1))  # as if another had written it
+        return ""
+
+    with pytest.raises(ValueError, match=r"checkpoint: expected one training with this name, got "):
+        run(path, look=look)
+    assert not path.exists()
+
+
 def test_checkpoint__is_refused_where_it_does_not_belong(tmp_path):
     path = tmp_path / "p.npz"
     run_until_interrupted(path)
