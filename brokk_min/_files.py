@@ -19,12 +19,10 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from brokk_min.machine import require
 
 LARGEST = 2**26  # bytes of the arrays of a policy or net, assumed; ours have a few MB
-QUICK = 10e6  # bytes that are read in a second or two
 NEW: set[Path] = set()  # files of the running command that must not be there before it writes them
 # a folder for each machine: policies, gains, starts and table of `make reproduce`
 SHIPPED = Path(__file__).parent / "shipped"
@@ -155,19 +153,6 @@ def expect_same(place: Path | str, found: Mapping[str, Any], wanted: Mapping[str
         require(got == value, f"{place}: {name}", brief(value), brief(got))
 
 
-def with_bar(file: IO[str]) -> Iterable[str]:
-    """The lines of a file; a bar shows how far it is read, if that takes more than a moment."""
-    size = os.fstat(file.fileno()).st_size
-    if size < QUICK:
-        yield from file
-        return
-    title = f"read {Path(file.name).name}"
-    with tqdm(total=size, desc=title, leave=False, disable=None, unit="B", unit_scale=True) as bar:
-        for line in file:
-            bar.update(len(line))
-            yield line
-
-
 def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
     """The cells of a CSV by column, see `numbers`; ValueError: no such columns, or a short row.
 
@@ -177,8 +162,7 @@ def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
         with open(path, newline="", encoding="utf-8-sig") as file:
             semicolons = ";" in file.readline()
             file.seek(0)
-            lines, separator = with_bar(file), ";" if semicolons else ","
-            header, *rows = csv.reader(lines, delimiter=separator, strict=True)
+            header, *rows = csv.reader(file, delimiter=";" if semicolons else ",", strict=True)
         if semicolons:
             rows = [[cell.replace(",", ".") for cell in row] for row in rows]
         names = [name.strip() for name in header]

@@ -3,7 +3,6 @@
 import errno
 import io
 import json
-import sys
 import zipfile
 
 import numpy as np
@@ -47,18 +46,6 @@ def test_damaged_bytes__are_refused_in_one_line_or_read(folder, name, data):
         message = str(error)
         assert message.startswith(f"{path}: ") and "expected " in message and ", got " in message
         assert "\n" not in message and len(message) < 300 + len(str(path))
-
-
-def test_read_csv__shows_how_far_a_large_file_is_read(tmp_path, monkeypatch):
-    path, terminal = tmp_path / "x.csv", io.StringIO()
-    path.write_text("time,u\n0,1\n")
-    monkeypatch.setattr(terminal, "isatty", lambda: True)
-    monkeypatch.setattr(sys, "stderr", terminal)
-    files.read_csv(path)
-    assert terminal.getvalue() == ""
-    monkeypatch.setattr(files, "QUICK", 11)
-    assert files.read_csv(path)["u"].tolist() == ["1"]
-    assert "read x.csv:" in terminal.getvalue() and "11.0" in terminal.getvalue()
 
 
 @pytest.mark.parametrize(

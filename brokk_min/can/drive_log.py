@@ -1,14 +1,16 @@
 """The log of a drive: its frames, what they say of each tick, and recordings for `fit`."""
 
+import os
 import re
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
+from tqdm import tqdm
 
-from brokk_min._files import brief, expected, require_package, with_bar
+from brokk_min._files import brief, expected, require_package
 from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame, Nodes
 from brokk_min.can.connection import plain_frame
@@ -67,6 +69,15 @@ def read_frames(path: Path) -> Iterator[Frame]:
                 require(bool(OTHER.fullmatch(line)), f"row {row}", wanted, brief(line))
                 strange = strange or f"row {row}: {brief(line)}"
         require(bool(buses) or not strange, str(path), "data frames of 11 bits", strange)
+
+
+def with_bar(file: TextIO) -> Iterator[str]:
+    """The lines of a file; a bar shows how far it is read."""
+    size, title = os.fstat(file.fileno()).st_size, f"read {Path(file.name).name}"
+    with tqdm(total=size, desc=title, leave=False, disable=None, unit="B", unit_scale=True) as bar:
+        for line in file:
+            bar.update(len(line))
+            yield line
 
 
 def one_bus(buses: dict[Any, None], bus: Any) -> None:

@@ -76,9 +76,9 @@ def train_policy(
     env, advantages, start = prepare(machine, net, recipe, seed)
     updates = math.ceil(config.total_steps / (config.num_envs * config.horizon))
     rows: Curve = []
+    ours = written(checkpoint)
     if checkpoint.exists() and checkpoint.stat().st_size:
         start, rows = load(checkpoint, about, env, start)
-    ours = written(checkpoint)
 
     def policy_of(agent: Agent) -> Policy:
         training = about | {"made_with": made_with()}

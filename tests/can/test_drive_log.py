@@ -1,6 +1,8 @@
 """Logs of drives, read as frames, as recordings and as telemetry."""
 
+import io
 import struct
+import sys
 from dataclasses import replace
 from itertools import chain
 
@@ -81,6 +83,15 @@ def test_read_frames__names_the_row_that_is_no_frame(tmp_path):
     (tmp_path / "log.csv").write_bytes(bytes(range(256)))
     with pytest.raises(ValueError, match=r"log\.csv: expected a candump log, got"):
         list(read_frames(tmp_path / "log.csv"))
+
+
+def test_read_frames__shows_how_far_a_log_is_read(tmp_path, monkeypatch):
+    path, terminal = tmp_path / "run.log", io.StringIO()
+    path.write_text("(1.000000) can0 080#\n")
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    assert len(list(read_frames(path))) == 1
+    assert "read run.log:" in terminal.getvalue() and "21.0" in terminal.getvalue()
 
 
 def test_log_for_fit__by_hand():
