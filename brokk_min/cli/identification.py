@@ -132,20 +132,24 @@ class Fit(ReadsLogs):
         check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs, machine)
+        every = log
         if self.test:
             with expected(self.test[0], "a log of the same joints"):
                 test = logs.in_order(self.read_logs(self.test, machine)[0], log.joints)
                 twins = inspection.repeated(test.recordings, log.recordings)
                 require(not twins, "--test", "recordings that LOGS has not", brief(twins))
+                validation.scored_steps(test, machine.history)  # now, not after the search below
             every = log._replace(recordings=(*log.recordings, *test.recordings))
-        else:
-            every, (log, test) = log, logs.split(log)
-        with expected((self.test or self.logs)[0], "a log to score on"):
-            validation.scored_steps(test, machine.history)  # now, not after the fit
         reports = inspection.inspect(every, known)
         for wrong in (*inspection.wrong_signs(reports), *inspection.mixed_up(reports)):
             raise ValueError(f"{self.logs[0]}: {wrong}")
-        warnings = [*inspection.warnings(every, reports, known)]
+        resting = inspection.resting(reports)
+        with expected(self.logs[0], "a log to fit to"):
+            log = logs.without(log, resting)
+        with expected((self.test or self.logs)[0], "a log to score on"):
+            log, test = (log, logs.without(test, resting)) if self.test else logs.split(log)
+            unscored = [*validation.unscored(test, machine.history)]
+        warnings = [*inspection.warnings(every, reports, known), *unscored]
         print(*(f"warning: {one}\n" for one in warnings), sep="", end="", flush=True)
         name = known.name if known else ""
         net = fitting.fit_nets(log, settings, self.seed, machine, name)
@@ -171,6 +175,8 @@ def print_scores(scores: Mapping[str, Any], warnings: Sequence[str]) -> None:
     if scores:
         print("joint: error of one step, of the last velocity again; of free runs [rad/s]:")
     for name, net in scores.items():
+        if not net["free_run"]:
+            continue
         errors = [net.get(f"{kind}_rmse", np.nan) for kind in ("one_step", "persistence")]
         runs = [f"{k} s {run['velocity_rmse']:.4f}" for k, run in net["free_run"].items()]
         print("{}: {:.4f}, {:.4f};".format(name, *errors), ", ".join(runs))

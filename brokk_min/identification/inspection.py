@@ -76,7 +76,7 @@ class JointReport(NamedTuple):
     coarse: float  # the same of means over half a second, in which noise and steps do not count
     delay: float  # s
     tau: float  # s
-    dead_zone: Pair  # of full command
+    dead_zone: Pair  # of full command; nan: no command opens the valve that way
     step: float  # rad, by which its angle usually changes in a tick, if it does
     by_zones: float  # part that it explains with the machine's dead zones; 1 if these are unknown
     still: list[str]  # recordings in which commands do not move it; all else is without them
@@ -113,6 +113,8 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     turned = opposite(recordings, j, rate)
     q_dot = np.concatenate([one.q_dot[:, j] for one in kept])
     steps = np.abs(np.diff(q))
+    opens = (model.gains != 0) & (model.zones < ZONES[-1])
+    dead_zone = np.where(opens, model.zones, np.nan)
     by = {
         name: fit_model(motion_of(kept, j, rate, span, i)).explained
         for i, name in enumerate(log.joints)
@@ -133,7 +135,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         coarse=explained_part(*coarse),
         delay=model.lag[0] / rate,
         tau=model.lag[1],
-        dead_zone=(model.zones[0], model.zones[1]),
+        dead_zone=(dead_zone[0], dead_zone[1]),
         step=float(np.median(steps[steps > 0])) if steps.any() else 0.0,
         by_zones=best_lag(motion, np.array(zones)).explained if zones else 1.0,
         still=still,
@@ -376,6 +378,11 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
             yield f"{wanted} in all recordings or in none, got some in {brief(report.opposite)}"
 
 
+def resting(reports: Mapping[str, JointReport]) -> set[str]:
+    """Recordings in which commands do not move a joint, whose motion nets must not learn."""
+    return {name for r in reports.values() if not r.other for name in r.still}
+
+
 Check = tuple[Any, str, str, str]  # if it holds: the place, what was expected there, what it got
 
 
@@ -411,7 +418,7 @@ def causes(name: str, r: JointReport) -> Iterator[Check]:
 def lacks(name: str, r: JointReport) -> Iterator[Check]:
     """What nets could not learn from a log."""
     got = f"recordings in which it rests (engine or pump off, or blocked?): {brief(r.still)}"
-    got = f"{got}; the figures are those of the others, if any"
+    got = f"{got}; figures and nets are of the others, if any"
     yield r.still and not r.other, name, "commands to move it", got
     yield r.rest, f"u_{name}", "0 at rest", f"{r.rest:.3g}"
     largest = max(r.largest)
@@ -437,7 +444,7 @@ def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
     yield narrow, name, f"{LEAST_RANGE:.0%} of its range or more", got
     if r.explained <= LEAST_EXPLAINED:
         return
-    apart = np.abs(np.subtract(r.dead_zone, joint.dead_zone)).max() > ZONE
+    apart = (np.abs(np.subtract(r.dead_zone, joint.dead_zone)) > ZONE).any()  # not nan
     worse = 1 - r.by_zones > WORSE * (1 - r.explained)
     got = "({:.2f}, {:.2f})".format(*r.dead_zone)
     yield apart and worse, name, f"the machine's dead_zone {joint.dead_zone}", got
@@ -502,11 +509,14 @@ def repeated(recordings: Sequence[Recording], others: Sequence[Recording]) -> li
 
 
 def table(reports: Mapping[str, JointReport]) -> Iterator[str]:
-    """What a log tells of each joint, and fields of `Joint` by it, to copy into a machine."""
+    """What a log tells of each joint, and fields of `Joint` by it, to copy into a machine.
+
+    A question mark stands where no command opens the valve that way.
+    """
     for name, r in reports.items():
         told = f"{r.minutes:.1f} minutes, sign {r.sign:+d}, {r.explained:.0%} explained"
         yield f"{name}: {told}, delay {r.delay:.2f} s"
         limits = f"q_min={r.low:.3f}, q_max={r.high:.3f}"
         speeds = "q_dot_up={:.3f}, q_dot_down={:.3f}".format(*r.fastest)
-        zones = "dead_zone=({:.3f}, {:.3f})".format(*r.dead_zone)
-        yield f'Joint("{name}", {limits}, {speeds}, {zones}, ...)'
+        zones = ", ".join("?" if np.isnan(zone) else f"{zone:.3f}" for zone in r.dead_zone)
+        yield f'Joint("{name}", {limits}, {speeds}, dead_zone=({zones}), ...)'

@@ -7,7 +7,7 @@ are estimated, because a bus carries angles alone. Joints may have any names. Th
 below the machine's, and it may jitter.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,13 @@ def split(log: Log) -> tuple[Log, Log]:
     fitted = compress(log.recordings, np.logical_not(scored))
     tested = compress(log.recordings, scored)
     return log._replace(recordings=tuple(fitted)), log._replace(recordings=tuple(tested))
+
+
+def without(log: Log, names: Collection[str]) -> Log:
+    """A log without some recordings; ValueError: it has no others."""
+    kept = tuple(one for one in log.recordings if one.name not in names)
+    require(len(kept) > 0, "recordings", "some in which commands move the joints", "none")
+    return log._replace(recordings=kept)
 
 
 def in_order(log: Log, joints: Sequence[str]) -> Log:

@@ -134,10 +134,13 @@ def pieces_of(
 
 
 def left_out(wrong: NDArray[np.bool_], q: Array, joints: Sequence[str]) -> Iterator[str]:
-    """A warning for each joint with `wrong` angles `q` (rows, n) of a table."""
+    """A warning for joints with `wrong` angles `q` (rows, n) of a table, one for those alike."""
+    alike: dict[tuple[int, str, int], list[str]] = {}
     for name, bad, angle in zip(joints, wrong.T, q.T, strict=True):
         if bad.any():
-            row = bad.argmax()
-            got = f"a jump to {angle[row]:.4g} (was the sensor not read?) in {bad.sum()} rows"
-            what = "which are left out or begin a new recording"
-            yield f"row {row + 2}: expected motion of q_{name}, got {got}, {what}"
+            row = int(bad.argmax())
+            alike.setdefault((row, f"{angle[row]:.4g}", bad.sum()), []).append(f"q_{name}")
+    for (row, angle, rows), names in alike.items():
+        got = f"a jump to {angle} (was the sensor not read?) in {rows} rows"
+        what = "which are left out or begin a new recording"
+        yield f"row {row + 2}: expected motion of {', '.join(names)}, got {got}, {what}"

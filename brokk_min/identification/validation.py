@@ -47,11 +47,12 @@ def free_run(
 
 
 def scored_steps(log: Log, history: int) -> NDArray[np.intp]:
-    """Samples from which one step can be scored; ValueError: there is none."""
+    """Samples from which one step can be scored; ValueError: there is none, or no motion."""
     samples = join_recordings(log)
     starts = samples.starts(history, 1, 1)
     wanted = f"a recording of more than {history + 1} samples to score on"
     require(len(starts) > 0, "log", wanted, samples.lengths[:9])
+    require(bool(samples.moves[starts].any()), "log", "motion to score on", "none")
     return starts
 
 
@@ -96,11 +97,16 @@ def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(np.square(error))))
 
 
+def unscored(log: Log, history: int) -> Iterator[str]:
+    """A warning for each joint that never moves where steps can be scored."""
+    for name, moves in zip(log.joints, join_recordings(log).moves[scored_steps(log, history)].T):
+        if not moves.any():
+            yield f"{name}: expected a recording to score on in which it moves (--test), got none"
+
+
 def warnings(scores: Mapping[str, Any]) -> Iterator[str]:
     """A warning for each net of `score` that is no better than the last velocity again."""
     for name, one in scores.items():
-        if not np.isfinite(one.get("one_step_rmse", np.nan)):
-            yield f"{name}: expected a recording to score on in which it moves (--test), got none"
         if one.get("one_step_rmse", 0) > one.get("persistence_rmse", 0):
             yield f"{name}: expected a net that errs less than the last velocity again, got more"
 

@@ -88,6 +88,38 @@ def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys)
     assert f"warning: {reversed_one}" in capsys.readouterr().out
 
 
+def test_fit__leaves_out_recordings_in_which_nothing_moves(tmp_path, capsys):
+    """In two of eight the pump is off; without one joint's tests its scores are not printed."""
+    moving = read_log(foreign_log(tmp_path / "log.csv", 0, 8), BROKK_170)
+    stands = [one._replace(q=0 * one.q + one.q[0], q_dot=0 * one.q) for one in moving.recordings]
+    logs = {"sound": moving.recordings[2:], "off": (*stands[:2], *moving.recordings[2:])}
+    for name, recordings in logs.items():
+        write_log(tmp_path / f"{name}.csv", moving._replace(recordings=recordings))
+        assert run(f"fit {TINY}", tmp_path / f"{name}.csv", "--out", tmp_path / f"{name}.npz") == 0
+    told = capsys.readouterr().out
+    assert "rests (engine or pump off, or blocked?): ['take 0', 'take 1']" in told
+    nets = [load_net(tmp_path / f"{name}.npz") for name in logs]
+    assert all(map(np.array_equal, *(net.weights for net in nets)))
+    write_log(tmp_path / "rests.csv", moving._replace(recordings=(stands[0],)))
+    files = [tmp_path / "sound.csv", "--test", tmp_path / "rests.csv", "--out", tmp_path / "n.npz"]
+    assert run(f"fit {TINY}", *files) == 1
+    wanted = "rests.csv: recordings: expected some in which commands move the joints, got none"
+    assert wanted in capsys.readouterr().err
+    alone = moving.recordings[0]
+    parked = alone._replace(u=alone.u * [1, 0], q=alone.q * [1, 0], q_dot=alone.q_dot * [1, 0])
+    write_log(tmp_path / "boom.csv", moving._replace(recordings=(parked,)))
+    files = [tmp_path / "sound.csv", "--test", tmp_path / "boom.csv", "--out", tmp_path / "n.npz"]
+    assert run(f"fit {TINY}", *files) == 0
+    told, _, scores = capsys.readouterr().out.partition("n.npz: nets")
+    assert "warning: arm: expected a recording to score on in which it moves" in told
+    assert "boom: " in scores and "arm: " not in scores
+    still = alone._replace(u=0 * alone.u, q=0 * alone.q, q_dot=0 * alone.q)
+    write_log(tmp_path / "still.csv", moving._replace(recordings=(still,)))
+    files[2] = tmp_path / "still.csv"
+    assert run(f"fit --force {TINY}", *files) == 1
+    assert "still.csv: log: expected motion to score on, got none" in capsys.readouterr().err
+
+
 def test_fit__knows_the_machine_of_a_log_and_the_papers_recipe(tmp_path, capsys):
     own = steady_log(tmp_path / "own.csv", MIXED)
     driven = steady_log(tmp_path / "driven.csv", ("q1", "q3", "q4", "q5"))  # without the locked q2

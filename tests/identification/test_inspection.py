@@ -13,6 +13,7 @@ from brokk_min.identification.inspection import (
     JointReport,
     inspect,
     repeated,
+    table,
     warnings,
     wrong_signs,
 )
@@ -271,6 +272,9 @@ def test_inspect__knows_commands_at_rest_and_switches():
     assert not sound.one_size and sound.rest == 0.0
     upwards = boom(*(np.abs(u) for u in SEVEN))  # it rests under commands within the dead zone
     assert upwards.rest == 0.0
+    assert upwards.dead_zone == pytest.approx((0.12, np.nan), abs=0.02, nan_ok=True)
+    _, told = table({"boom": upwards})
+    assert "dead_zone=(0.1" in told and ", ?)" in told
 
 
 def test_inspect__compares_dead_zones_with_those_of_the_machine():

@@ -140,6 +140,10 @@ def test_read_log__leaves_out_readings_that_no_motion_explains(tmp_path, wrong, 
     told = f"log.npz: row 2: expected motion of q_a, got a jump to {wrong:.4g} (was the "
     assert told in log.warnings[0] and " in 4 rows, which are left out" in log.warnings[0]
     assert "log.npz: row 62: expected motion of q_b" in log.warnings[1]
+    columns["q_a"][:], columns["q_b"][:3] = columns["q_b"], np.nan
+    columns["q_a"][:3] = np.nan
+    told = "log.npz: row 2: expected motion of q_a, q_b, got a jump to nan"
+    assert read_columns(tmp_path, columns, machine).warnings[0].startswith(str(tmp_path / told))
 
 
 def test_read_log__keeps_the_readings_of_a_noisy_sensor(tmp_path):

@@ -61,6 +61,18 @@ def test_read_ros__takes_stamps_of_headers_on_the_clock_of_the_recorder(tmp_path
     assert len(warnings) == 1 and warnings[0].startswith(told)
 
 
+def test_read_ros__lets_one_node_be_farther_away_than_another(tmp_path):
+    messages = [(99.9, "/valves", multi_array([0.5, 0.5]))]
+    for k in range(60):
+        for name, late in (("boom", 0.002), ("arm", 0.030)):  # each always as late
+            q = joint_state([name], [0.01 * k], stamp=100 + k / 20)
+            messages.append((100 + k / 20 + late, "/joint_states", q))
+    table, warnings = read_ros(record(tmp_path / "bag", messages), "/joint_states", "/valves")
+    np.testing.assert_allclose(table["time"] - 100.002, np.arange(60) / 20, atol=1e-6)
+    np.testing.assert_allclose(table["q_arm"], table["q_boom"], atol=1e-9)
+    assert len(warnings) == 1 and "one order of the joints" in warnings[0]
+
+
 def test_read_ros__puts_together_what_several_nodes_send_and_says_so(tmp_path):
     """Angles of the arm come 20 ms after those of the boom; ten were not read."""
     messages = [(99.9, "/valves", multi_array([0.5, -0.5]))]
