@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import subprocess
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib import import_module, metadata
@@ -128,14 +129,14 @@ def brief(value: Any, longest: int = 110) -> str:
 def expected(path: Path, what: str) -> Iterator[None]:
     """Turn any error of the block into a ValueError: `path` is not `what`.
 
-    OSError and MemoryError stay as they are. An error that says what was expected only gets `path`
-    in front of it.
+    An OSError that names its file stays as it is. An error that says what was expected only gets
+    `path` in front of it.
     """
     try:
         yield
-    except (OSError, MemoryError):
-        raise
     except (Exception, SystemExit) as error:  # zlib, NumPy, a user's file: they raise anything
+        if isinstance(error, OSError) and error.filename:
+            raise
         told = str(error) if ": expected " in str(error) else f"expected {what}, got {brief(error)}"
         raise ValueError(f"{path}: {told.removeprefix(f'{path}: ')}") from error
 
@@ -156,16 +157,22 @@ def expect_same(place: Path | str, found: Mapping[str, Any], wanted: Mapping[str
 def read_csv(path: Path, *columns: str) -> dict[str, NDArray[np.str_]]:
     """The cells of a CSV by column, see `numbers`; ValueError: no such columns, or a short row.
 
-    Where semicolons separate the cells, commas are those of decimals.
+    Where semicolons or tabs separate the cells, commas are those of decimals.
     """
     with expected(path, "a CSV table"):
         with open(path, newline="", encoding="utf-8-sig") as file:
-            semicolons = ";" in file.readline()
+            first = file.readline()
+            require(bool(first.strip()), str(path), "a header and rows", "none")
+            delimiter = next((mark for mark in ";\t" if mark in first), ",")
             file.seek(0)
-            header, *rows = csv.reader(file, delimiter=";" if semicolons else ",", strict=True)
-        if semicolons:
+            header, *rows = csv.reader(file, delimiter=delimiter, strict=True)
+        while rows and not rows[-1]:  # blank lines at the end
+            rows.pop()
+        if delimiter != ",":
             rows = [[cell.replace(",", ".") for cell in row] for row in rows]
         names = [name.strip() for name in header]
+        twice = [name for i, name in enumerate(names) if name and name in names[:i]]
+        require(not twice, str(path), "each column once", f"again {brief(twice)}")
         missing = [name for name in columns if name not in names]
         require(not missing, str(path), f"columns {missing}", brief(names))
         require(len(rows) > 0, str(path), "rows", "none")
@@ -199,13 +206,20 @@ def save_arrays(path: Path, kind: str, header: Mapping[str, Any], **arrays: Any)
         np.savez_compressed(file, header=text, **arrays)
 
 
+def open_npz(path: Path) -> Any:
+    """An `.npz`, from which nothing is executed; ValueError: another kind of file."""
+    zipped = zipfile.is_zipfile(path) or not Path(path).is_file()
+    require(zipped, str(path), "an .npz file (arrays in a zip archive)", "another kind of file")
+    return np.load(path, allow_pickle=False)
+
+
 def load_arrays(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Header and arrays of an `.npz`; nothing in it is executed.
 
     The header is read first, and the arrays if they are those of this `kind`. ValueError: no
     readable `.npz`, another kind, unpacked too large, or an array of anything but finite numbers.
     """
-    with expected(path, "a readable .npz file"), np.load(path, allow_pickle=False) as archive:
+    with expected(path, "a readable .npz file"), open_npz(path) as archive:
         size = sum(entry.file_size for entry in archive.zip.infolist())
         require(size <= LARGEST, str(path), f"at most {LARGEST:,} bytes", f"{size:,}")
         header = json.loads(str(archive["header"])) if "header" in archive else {}

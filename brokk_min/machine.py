@@ -174,6 +174,8 @@ class Machine:
             signed = j.encoder_sign in (-1, 1)
             require(signed, f"{j.name}.encoder_sign", "-1 or 1", j.encoder_sign)
             require(j.q_min < j.q_max, f"{j.name}.q_max", f"above {j.q_min}", j.q_max)
+            step = j.encoder_step
+            require(step > 0, f"{j.name}.encoder_step", "a positive number", step)
         nodes = [*(joint.encoder_node for joint in self.joints), self.controller_node]
         require(all(1 <= node <= 127 for node in nodes), "CANopen nodes", "1 to 127", nodes)
         for what, values in (("names", [*self.names]), ("CANopen nodes", nodes)):

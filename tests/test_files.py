@@ -56,6 +56,8 @@ def test_damaged_bytes__are_refused_in_one_line_or_read(folder, name, data):
         ("time,u\n0,1\n1\n", "row 3: expected 2 cells, got 1"),
         ("time,u\n", "expected rows, got none"),
         ("time,v\n0,1\n", "expected columns ['u'], got ['time', 'v']"),
+        ("time,u,u\n0,1,2\n", "expected each column once, got again ['u']"),
+        ("", "expected a header and rows, got none"),
     ],
 )
 def test_read_csv__refuses_cells_that_are_missing_or_no_numbers(tmp_path, text, message):
@@ -64,6 +66,18 @@ def test_read_csv__refuses_cells_that_are_missing_or_no_numbers(tmp_path, text, 
     with pytest.raises(ValueError) as caught:
         files.numbers(path, "u", files.read_csv(path, "time", "u")["u"])
     assert str(caught.value) == f"{path}: {message}"
+
+
+def test_read_csv__takes_tabs_decimal_commas_and_blank_lines_at_the_end(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("time\tu\n0\t0,5\n1\t-1\n\n")
+    np.testing.assert_array_equal(files.numbers(path, "u", files.read_csv(path)["u"]), [0.5, -1])
+
+
+def test_load_arrays__does_not_advise_to_trust_a_text(tmp_path):
+    (tmp_path / "x.npz").write_text("{}")
+    with pytest.raises(ValueError, match=r"x.npz: expected an .npz file \(arrays in a zip archive"):
+        files.load_arrays(tmp_path / "x.npz", "policy 8")
 
 
 def test_load_policy__refuses_a_file_without_any_one_of_its_fields(tmp_path):
@@ -79,6 +93,10 @@ def test_load_policy__refuses_a_file_without_any_one_of_its_fields(tmp_path):
             with pytest.raises(ValueError, match=r"^\S+p\.npz: expected [^\n]+, got .*" + name):
                 load_policy(path, BROKK_170)
             place[name] = value
+    for training in (None, {"recipe": None}):
+        files.save_arrays(path, KIND, header | {"training": training}, **arrays)
+        with pytest.raises(ValueError, match="training: expected its seed and recipe, got"):
+            load_policy(path, BROKK_170)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from brokk_min._files import brief, numbers, read_csv, require_package
 from brokk_min.can.canopen import OperatorInput
 from brokk_min.machine import Array, Machine, Measured, require
 
+DAY = 86400.0  # s, assumed: nobody's script is longer
 PATIENCE = 5.0  # s that a script waits until the machine is ready
 
 
@@ -20,18 +21,26 @@ def read_commands(path: Path, machine: Machine) -> dict[str, Array]:
     """Goals (T, 3) [m/s] of each sequence of a CSV `sequence,time,vx,vy,vz` [s, m/s], by its name.
 
     Values hold until the next row; the last row of a sequence is its end. ValueError: no such
-    table, rows below a tick apart, or goals faster than the machine's tool speed.
+    table, rows below a tick apart, goals faster than the machine's tool speed, or that lead farther
+    than any arm.
     """
     names = ("time", "vx", "vy", "vz")
     table = read_csv(path, "sequence", *names)
     columns = np.stack([numbers(path, name, table[name]) for name in names], axis=1)
+    reach = 2 * sum(abs(joint.a) + abs(joint.d) for joint in machine.joints)  # m
     goals = {}
     for name in dict.fromkeys(table["sequence"].tolist()):
         rows = columns[table["sequence"] == name]
         time, velocity = rows[:, 0] - rows[0, 0], rows[:, 1:]
         fits = len(time) > 1 and (np.diff(time) > 0.99 * machine.dt).all() and np.isfinite(rows)
         wanted = "two or more rows of finite numbers, each a tick or more after the one before"
-        require(bool(np.all(fits)), f"{path}: sequence {name}", wanted, brief(time.tolist()))
+        got = brief(time.tolist() if np.isfinite(rows).all() else rows.tolist())
+        require(bool(np.all(fits)), f"{path}: sequence {name}", wanted, got)
+        require(time[-1] <= DAY, f"{path}: sequence {name}", f"at most {DAY:g} s", time[-1])
+        path_of_tool = np.cumsum(velocity[:-1] * np.diff(time)[:, None], axis=0)
+        farthest = float(np.abs(path_of_tool).max())
+        wanted, got = f"a motion within {reach:.3g} m", f"{farthest:.3g} m: is time in s?"
+        require(farthest <= reach, f"{path}: sequence {name}", wanted, got)
         tick = np.arange(round(time[-1] * machine.rate))
         row = np.searchsorted(time, tick / machine.rate + 1e-6, "right") - 1
         goals[name] = velocity[row]

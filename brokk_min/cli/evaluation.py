@@ -61,13 +61,13 @@ class Evaluate(Command):
             )
         runs, _ = metrics.evaluate(machine, controllers, commands, starts, self.seed, plant)
         runs = [run | {"kind": "file"} for run in runs] if self.starts else runs
-        print(table(runs))
         if self.json:
             meta = {"policy": str(path), "gains": str(gains or "tuned now"), "plant": self.plant}
             meta["commands"] = str(self.commands or "own")
             meta["starts"] = str(self.starts or self.num_starts)
             meta |= metrics.metadata(machine, self.seed)
             write_json(self.json, {"meta": meta, "runs": runs})
+        print(table(runs))
 
     def task(self, machine: Machine) -> tuple[list[sequences.Commands], Array]:
         """Velocity sequences and start poses of files, or the machine's own."""

@@ -156,13 +156,13 @@ class Fit(ReadsLogs):
         scores = validation.score(net, test)
         of_scores = [*validation.warnings(scores)]
         save_net(self.out, net)
-        print(f"{self.out}: nets of {name or 'an unknown machine: one a joint, without a valve'}")
-        print_scores(scores, of_scores)
         if self.json:
             files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
             meta = {"machine": name, **files, **net.training}
             told = {"joints": scores, "warnings": of_scores + warnings}
             write_json(self.json, {"meta": meta} | told)
+        print(f"{self.out}: nets of {name or 'an unknown machine: one a joint, without a valve'}")
+        print_scores(scores, of_scores)
 
 
 def is_table(path: Path) -> bool:

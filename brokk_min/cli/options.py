@@ -4,7 +4,8 @@ import os
 import runpy
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -55,6 +56,7 @@ class Command:
         """WrongUse: a seed or a number of starts that is none."""
         seed, num_starts = getattr(self, "seed", 0), getattr(self, "num_starts", 1)
         check(seed >= 0, "--seed", "0 or more", seed)
+        check(seed < 2**63, "--seed", "less than 2^63", seed)
         check(num_starts > 0, "--num-starts", "1 or more", num_starts)
 
     @classmethod
@@ -70,6 +72,11 @@ class Command:
         check(isinstance(machine, Machine), "--machine", "a Machine", brief(machine))
         longest = max(max(abs(j.a), abs(j.d)) for j in machine.joints)
         check(longest < LONGEST, "--machine", f"links in metres, below {LONGEST}", longest)
+        check(len(machine.driven) > 0, "--machine", "a driven joint or more", "none")
+        for j in machine.joints:
+            turns = j.kind == "revolute" and j.q_max - j.q_min > 4 * np.pi
+            got = f"{j.q_min:g} to {j.q_max:g}: degrees?"
+            check(not turns, "--machine", f"a range of {j.name} in rad, up to two turns", got)
         return machine  # type: ignore[no-any-return]
 
     def writes(self, *paths: Path | None, reads: Sequence[Path | None] = ()) -> None:
@@ -80,7 +87,9 @@ class Command:
         """
         outputs = [path for path in paths if path]
         options = (x if isinstance(x, tuple) else (x,) for x in vars(self).values())
-        sources = [Path(x.rpartition(":")[0]) for x in vars(self).values() if ".py:" in str(x)]
+        texts = [x for x in vars(self).values() if isinstance(x, str)]
+        sources = [Path(x.rpartition(":")[0]) for x in texts if ".py:" in x]
+        sources += [Path(x) for x in texts if x.endswith(".npz")]  # nets as a plant
         inputs = [x for x in (*chain(*options), *sources, *reads) if isinstance(x, Path)]
         inputs = [x.resolve() for x in inputs if not any(x is path for path in outputs)]
         for i, path in enumerate(outputs):
@@ -140,11 +149,22 @@ def find_plant(name: str, machine: Machine) -> Plant:
     state = plant.reset(machine, q.copy())
     for _ in range(round(2 * machine.rate)):
         state = plant.step(machine, state, u)
-    moved = np.diag(np.asarray(state.q) - q)
+    moved = np.diag(np.asarray(state.q, float) - q)
     fits = np.all((moved > 0.005) & (moved < 1.5 * (high - low)))  # not in degrees
     wanted = "each joint to go up in 2 s of the largest command"
     require(bool(fits), name, wanted, f"{moved.round(3)} rad")
     return plant
+
+
+@contextmanager
+def of_user(name: str, what: str) -> Iterator[None]:
+    """Run code of a user's file: any error is a ValueError, and paths stay those of the shell."""
+    before = os.getcwd()
+    with expected(Path(name), what):
+        try:
+            yield
+        finally:
+            os.chdir(before)
 
 
 @dataclass(frozen=True)
@@ -160,14 +180,12 @@ class OwnPlant:
 
     def step(self, machine: Machine, state: Any, u: Any) -> Any:
         """One tick under the held command `u` [-1, 1] (..., n)."""
-        return self.checked("step", np.shape(state.q), machine, state, u)
+        return self.checked("step", np.shape(state.q), machine, state, np.array(u))
 
     def checked(self, method: str, shape: tuple[int, ...], *arguments: Any) -> Any:
         """ValueError: whatever the file does, or a state without finite angles of this shape."""
-        before = os.getcwd()
-        with expected(Path(self.name), "a plant whose states have angles q"):
+        with of_user(self.name, "a plant whose states have angles q"):
             state = getattr(self.plant, method)(*arguments)
-            os.chdir(before)  # paths are those of the shell
             q = np.asarray(state.q, float)
             require(q.shape == shape, "angles q of a state", f"an array {shape}", q.shape)
             require(bool(np.isfinite(q).all()), "angles q of a state", "finite numbers", brief(q))
@@ -177,7 +195,7 @@ class OwnPlant:
 def own_controller(name: str, machine: Machine, net: ActuatorNet) -> Controller:
     """What NAME(machine, nets of its driven joints) of `FILE.py:NAME` gives, see `Controller`."""
     make = load_object("--controller", name)
-    with expected(Path(name), "a function of machine and nets that gives a Controller"):
+    with of_user(name, "a function of machine and nets that gives a Controller"):
         controller: Controller = make(machine, net)
         require(callable(controller.start), "start", "a method", controller.start)
     return OwnController(name, machine, controller)
@@ -192,12 +210,13 @@ class OwnController:
     inner: Controller
 
     def start(self, num: int) -> Any:
-        """Its state, for `num` machines."""
-        return self.inner.start(num)
+        """Its state, for `num` machines. ValueError: whatever the file does."""
+        with of_user(self.name, "a controller whose start(num) gives its state"):
+            return self.inner.start(num)
 
     def __call__(self, measured: Measured, state: Any) -> tuple[Array, Any]:
         """ValueError: whatever the file does, or what are no finite commands (num, n)."""
-        with expected(Path(self.name), "a controller that returns commands and its state"):
+        with of_user(self.name, "a controller that returns commands and its state"):
             u, state = self.inner(measured, state)
             shape = (len(measured.q), self.machine.n)
             require(np.shape(u) == shape, "commands", f"an array {shape}", np.shape(u))

@@ -77,13 +77,15 @@ class Train(Training):
         recipe = self.recipe()
         from brokk_min.learning.checkpoint import train_policy
 
-        self.writes(self.out, None if self.resume else Path(f"{self.out}.csv"))
-        commands = sequences.axis_sequences(machine)
-        starts = sequences.evaluation_starts(machine, STARTS, commands, 0)  # can it follow any?
         checkpoint = Path(f"{self.out}.checkpoint")
         empty = checkpoint.exists() and not checkpoint.stat().st_size
         got = "an empty checkpoint: one runs, or was killed before its first (then remove the file)"
         check(not empty, str(checkpoint), "no training with this name", got)
+        begun = checkpoint.exists() and not self.resume
+        check(not begun, str(checkpoint), "--resume or no checkpoint", "one")
+        self.writes(self.out, None if self.resume else Path(f"{self.out}.csv"))
+        commands = sequences.axis_sequences(machine)
+        starts = sequences.evaluation_starts(machine, STARTS, commands, 0)  # can it follow any?
         try:
             checkpoint.touch(exist_ok=self.resume)  # the name is taken, for other trainings
         except FileExistsError:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min._files import brief, numbers, read_csv
+from brokk_min._files import brief, numbers, open_npz, read_csv
 from brokk_min.identification.ros_logs import COMMAND_TIME, read_ros
 from brokk_min.machine import Array, require
 
@@ -58,7 +58,7 @@ def load_table(
     if path.suffix.lower() == ".csv":
         return find_columns(path, read_csv(path), mapped), []
     if path.suffix.lower() == ".npz":
-        with np.load(path, allow_pickle=False) as archive:  # only what is wanted is read
+        with open_npz(path) as archive:  # only what is wanted is read
             return find_columns(path, archive, mapped), []
     table, warnings = read_ros(path, *topics)
     return find_columns(path, table, mapped), warnings

@@ -43,6 +43,8 @@ def net_from_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, 
         found = {**header, **arrays, "joints": tuple(header["joints"])}
         found["weights"] = tuple(arrays[f"weight_{i}"] for i in range(6))
         net = kind(**{field.name: found[field.name] for field in fields(kind)})
+        inputs = net.input_scale.shape[-1]
+        require(3 * net.history <= inputs, "history", f"samples of {inputs} inputs", net.history)
         scaled = bool((net.input_scale > 0).all())
         require(scaled, "input_scale", "positive numbers", net.input_scale.min())
         net.predict(np.zeros((1, len(net.joints), 3, net.history), np.float32))  # do shapes fit?

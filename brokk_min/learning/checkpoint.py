@@ -5,7 +5,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,9 @@ def train_policy(
         bar.update(now.global_step - bar.n)
         bar.set_postfix_str(f"error {error:.3f} m/s")
         if look and now.update % max(1, updates // LOOKS) == 0:
-            bar.write(f"{now.global_step:,} steps: {look(policy_of(now.agent))}")
+            told = f"{now.global_step:,} steps: {look(policy_of(now.agent))}"
+            with suppress(OSError):  # nobody reads on, as after `| head`
+                bar.write(told)
         if now.update % EVERY == 0 or now.global_step >= config.total_steps:
             alone = written(checkpoint) in (0, ours)
             require(alone, str(checkpoint), "one training with this name", "another, which goes on")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from brokk_min import env
-from brokk_min._files import constants, expect_same, expected, load_arrays, save_arrays
+from brokk_min._files import brief, constants, expect_same, expected, load_arrays, save_arrays
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond import interface, valve_nets
 from brokk_min.identification.net_file import net_arrays, net_from_arrays, select_nets
@@ -103,6 +103,9 @@ def load_policy(path: Path, machine: Machine) -> Policy:
     header, arrays = load_arrays(path, KIND)
     with expected(path, "a complete policy"):
         expect_same(path, header["contract"], contract(machine, header["interface"]))
+        training = header["training"]
+        told = isinstance(training, dict) and isinstance(training.get("recipe", {}), dict)
+        require(told, "training", "its seed and recipe", brief(training))
         mean, scale = INTERFACES[header["interface"]].scale(machine)
         fits = np.array_equal(arrays["mean"], mean) and np.array_equal(arrays["scale"], scale)
         require(fits, str(path), "the machine's tool_speed, q_dot_up and q_dot_down", "others")
@@ -116,4 +119,4 @@ def load_policy(path: Path, machine: Machine) -> Policy:
             require(fits, f"layer_{i}", f"an array float32 {shape}", got)
         of_net = {name: array for name, array in arrays.items() if name not in own}
         net = select_nets(machine, net_from_arrays(path, header["net"], of_net))
-        return Policy(machine, header["training"], weights, net, header["interface"])
+        return Policy(machine, training, weights, net, header["interface"])

@@ -1,6 +1,8 @@
 """The commands that compare, on small files: what they write, print and refuse."""
 
 import json
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -21,7 +23,7 @@ def evaluate(folder, options=""):
     return run(f"evaluate {files} {options}")
 
 
-def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
+def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys, monkeypatch):
     out, errors = folder / "e.json", []
     files = {"policy": "policy.npz", "gains": "gains.json", "commands": "c.csv", "starts": "s.csv"}
     used = {key: str(folder / file) for key, file in files.items()}
@@ -39,6 +41,11 @@ def test_evaluate__writes_what_it_used_and_prints_means(folder, capsys):
         assert f"{'strongest PID':56}{'closed':>15}{errors[-1][-1]:15.4g}" in printed
     assert len({*errors}) == 3
     assert evaluate(folder, f"--json {out}") == 2  # it is there
+    out.unlink()
+    with suppress(OSError), open("/dev/full", "w", buffering=1) as lost:  # what is printed
+        monkeypatch.setattr(sys, "stdout", lost)
+        assert evaluate(folder, f"--json {out}") == 1
+    assert json.loads(out.read_text())["meta"].items() >= used.items()
 
 
 BAD = """
@@ -49,6 +56,12 @@ class Nan:
     def __call__(self, measured, state): return np.nan * np.ones((len(measured.q), 5)), None
 class Short(Nan):
     def __call__(self, measured, state): return np.ones((len(measured.q), 2)), None
+class Ends(Nan):
+    def start(self, num): raise SystemExit(0)
+class Moves(Nan):
+    def __call__(self, measured, state):
+        import os; os.chdir("/")
+        return np.ones((len(measured.q), 5)), None
 class Alone(Nan):
     def __call__(self, measured, state): return np.ones((len(measured.q), 5))
 """
@@ -68,6 +81,11 @@ def test_evaluate__takes_a_controller_of_ones_own(folder, capsys):
     for kind, words in zip(("Nan", "Short", "Alone"), told, strict=True):
         assert evaluate(folder, f"--controller {folder}/bad.py:{kind}") == 1
         assert words in capsys.readouterr().err
+    assert evaluate(folder, f"--controller {folder}/bad.py:Ends") == 1
+    assert "expected a controller whose start(num) gives its state" in capsys.readouterr().err
+    before = Path.cwd()
+    assert evaluate(folder, f"--controller {folder}/bad.py:Moves") == 0
+    assert Path.cwd() == before
     (folder / "none.py").write_text("NUMBER = 3\n")
     assert evaluate(folder, f"--controller {folder}/none.py:NUMBER") == 1
     assert "NUMBER: expected a function of machine and nets" in capsys.readouterr().err

@@ -10,6 +10,7 @@ from helpers_machines import small_net
 from brokk_min.actuator import PLANT
 from brokk_min.can.canopen import Frame
 from brokk_min.can.simulated_machine import SimulatedMachine
+from brokk_min.cli.identification import Collect
 from brokk_min.cli.options import Command, WrongUse, default_policy, find_plant
 from brokk_min.identification.net_file import save_net
 from brokk_min.machine import BROKK_170
@@ -21,6 +22,8 @@ from brokk_min.machine import BROKK_170
 from brokk_min.actuator import AnalyticPlant
 DIGGER = replace(BROKK_170, name=NAME)
 LONG = replace(DIGGER, joints=tuple(replace(j, a=1000 * j.a) for j in DIGGER.joints))
+TURNS = replace(DIGGER, joints=tuple(replace(j, q_max=57 * j.q_max) for j in DIGGER.joints))
+PARKED = replace(DIGGER, joints=tuple(replace(j, driven=False) for j in DIGGER.joints))
 NUMBER = 3
 
 class Own(AnalyticPlant):
@@ -35,6 +38,12 @@ class Own(AnalyticPlant):
         state = super().step(machine, state, self.sign * u)
         return state._replace(q=self.scale * state.q[..., : self.joints])
 
+class Overwrites(Own):
+    def step(self, machine, state, u):
+        u *= 0.5
+        return super().step(machine, state, 2 * u)
+
+OVERWRITES = Overwrites()
 OWN, REVERSED, BROKEN, DEGREES = Own(), Own(-1.0), Own(scale=float("nan")), Own(scale=57.3)
 FEWER, ENDS = Own(joints=4), Own(ends=60)
 
@@ -63,6 +72,10 @@ def test_find_machine__takes_a_name_or_an_object_of_a_file(file):
         Command(machine=f"{file}:NUMBER").find_machine()
     with pytest.raises(WrongUse, match=r"--machine: expected links in metres, below 100, got 1250"):
         Command(machine=f"{file}:LONG").find_machine()
+    with pytest.raises(WrongUse, match=r"a range of q1 in rad, .*, got -2.14 to 121.98: degrees\?"):
+        Command(machine=f"{file}:TURNS").find_machine()
+    with pytest.raises(WrongUse, match=r"--machine: expected a driven joint or more, got none"):
+        Command(machine=f"{file}:PARKED").find_machine()
     with pytest.raises(WrongUse, match=r"--machine: expected an object NONE in .*, got none"):
         Command(machine=f"{file}:NONE").find_machine()
     file.write_text("1 / 0")
@@ -100,6 +113,9 @@ def test_writes__refuses_a_name_for_two_files_before_the_work(tmp_path, monkeypa
     command.writes(Path("e"), command.json)
     with pytest.raises(WrongUse, match=r"m.py: expected a name of its own"):
         Reads(machine="m.py:M", force=True).writes(Path("m.py"))
+    with pytest.raises(WrongUse, match=r"net.npz: expected a name of its own"):
+        out = Path("net.npz")
+        Collect(plant="net.npz", out=out, force=True).writes(out)
 
 
 def test_writes__refuses_what_is_no_file_before_the_work(tmp_path, monkeypatch):
@@ -115,6 +131,9 @@ def test_find_plant__tries_each_joint(file):
     assert find_plant("analytic", BROKK_170) is PLANT
     q = np.array(BROKK_170.q_start)
     assert np.array_equal(find_plant(f"{file}:OWN", BROKK_170).reset(BROKK_170, q).q, q)
+    plant, u = find_plant(f"{file}:OVERWRITES", BROKK_170), np.full(5, 0.5)
+    plant.step(BROKK_170, plant.reset(BROKK_170, q), u)
+    assert (u == 0.5).all()  # what is recorded is what was commanded
     for name, message in {
         "NUMBER": "expected a plant .* got 'int' object has no attribute 'reset'",
         "REVERSED": r"expected each joint to go up .* got \[-",

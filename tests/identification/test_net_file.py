@@ -33,6 +33,7 @@ def test_load_net__gives_the_net_that_was_saved(tmp_path, net):
     [
         ({"kind": "policy 5"}, "expected .*actuator net 6 .*fit again.*, got 'policy 5'"),
         ({"reads": "valve"}, "expected a complete actuator net, got .*dead_zones"),
+        ({"history": 10**9}, "history: expected samples of 39 inputs, got 1000000000"),
         ({"joints": ["a", "b"]}, "input_mean: expected a row for each of 2 joints, got .3, 39."),
     ],
 )

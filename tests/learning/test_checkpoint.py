@@ -1,6 +1,8 @@
 """Training with files: the same bits after an interruption, curves, refusals."""
 
 import os
+import sys
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -120,6 +122,18 @@ def test_checkpoint__is_refused_where_it_does_not_belong(tmp_path):
         run(path, seed=6)
     with pytest.raises(ValueError, match="actuator: expected"):
         run(path, net=obedient_net(BROKK_170))
+    checkpoint = tmp_path / "p.npz.checkpoint"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
+    with pytest.raises(ValueError, match=rf"^{checkpoint}: expected a readable checkpoint, got "):
+        run(path)
+
+
+def test_train_policy__goes_on_if_nobody_reads_what_it_prints(tmp_path, monkeypatch):
+    with suppress(OSError), open("/dev/full", "w", buffering=1) as lost:
+        monkeypatch.setattr(sys, "stdout", lost)
+        run(tmp_path / "p.npz", look=lambda policy: "well")
+    monkeypatch.undo()
+    assert load_policy(tmp_path / "p.npz", BROKK_170).training["seed"] == 5
 
 
 def test_checkpoint__executes_nothing(tmp_path):

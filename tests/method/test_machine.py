@@ -57,6 +57,7 @@ BAD = [
     ({"joint": 3, "dead_zone": 0.1}, "q4.dead_zone: expected a pair, up and down, got 0.1"),
     ({"joint": 3, "kind": "screw"}, "q4.kind: expected revolute or prismatic, got screw"),
     ({"joint": 1, "encoder_sign": 0}, "q2.encoder_sign: expected -1 or 1, got 0"),
+    ({"joint": 1, "encoder_step": 0.0}, "q2.encoder_step: expected a positive number, got 0"),
     ({"name": ""}, "name: expected one of machine and joints, got none"),
     ({"joint": 1, "name": ""}, "name: expected one of machine and joints, got none"),
     ({"name": Path("mini")}, "name: expected a text, got mini"),
