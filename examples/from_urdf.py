@@ -144,15 +144,18 @@ def limits(chain: Chain, i: int) -> tuple[float, float, float]:
     low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
     speed = model.velocityLimit[joint.idx_v]
     low, high = (low, high) if joint.nq == 1 else (-np.inf, np.inf)  # 2: it turns without an end
-    usable = -100 < low < high < 100
+    usable, stand_in = -100 < low < high < 100, (0.0, 1.0) if slides else (-np.pi, np.pi)
     turns = not slides and np.isin(np.abs([low, high]).round(2), [3.14, 6.28]).any()
     if turns or not usable:
-        doubt = "look like placeholders or degrees: measure its range; a bus needs less than a turn"
-        warn(f"{name}: the limits {low:g} to {high:g} {doubt}")
+        others = "millimetres" if slides else "degrees"
+        doubt = "are the wrong way round" if low > high else f"look like placeholders or {others}"
+        needs = "" if slides else "; a bus needs less than a turn"
+        needs += "" if usable else f" ({stand_in[0]:.3g} to {stand_in[1]:.3g} stand in)"
+        warn(f"{name}: the limits {low:g} to {high:g} {doubt}: measure its range{needs}")
     elif not slides and (max(-low, high) > 2 * np.pi or high - low > 3 * np.pi):
         warn(f"{name}: the limits {low:g} to {high:g} rad look like degrees")
     if not usable:
-        low, high = (0.0, 1.0) if slides else (-np.pi, np.pi)
+        low, high = stand_in
     if not 0 < speed < FASTEST:
         warn(f"{name}: the velocity limit {speed:g} looks like a placeholder: {SPEED} stands in")
         speed = SPEED

@@ -90,6 +90,8 @@ def test_rounded_right_angles__count_as_parallel(tmp_path, capsys):
     [
         (2, 6, 35, "boom: the limits -1.1 to 35 rad look like degrees"),
         (2, slice(5, 7), (-5, 5), "boom: the limits -5 to 5 rad look like degrees"),
+        (2, slice(5, 7), (1.1, -0.5), "boom: the limits 1.1 to -0.5 are the wrong way round"),
+        (4, 6, 1500, "placeholders or millimetres: measure its range (0 to 1 stand in)"),
         (3, 2, "1800 0 0", "boom: its link of 1800 m looks like centimetres or millimetres"),
         (6, 2, "0.1 -0.45 0.2", "bucket: cannot move the tool, which lies on its axis"),
     ],
