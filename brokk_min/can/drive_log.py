@@ -31,6 +31,7 @@ OTHER = re.compile(
     r"(?:[0-9A-Fa-f]{8}[# ]|[0-9A-Fa-f]{3}(?:#R|##|#\w{16}_| +\[(?:\d{2}|9)\]| +\[0\] +remote)).*\n"
 )
 NOTES = ("operator", "timing", "valves", "shadow")  # no buses: what `drive` notes beside the frames
+LOST = 1.0  # s, assumed: a shorter gap in a drive is no pause of the operator
 FALLS = 0.01  # of the rows: time falls once if a clock was set, in differences each tick
 OTHERS = (".asc", ".blf", ".trc", ".gz")  # that python-can reads
 
@@ -139,23 +140,34 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     """
     missing = {canopen.SYNC, machine.valve_frame_id, *Nodes(machine).position_index}
     wanted = f"SYNC, positions and valve frames, {identifiers(missing)} (--machine)"
+    syncs = 0
 
     def noted() -> Iterator[Frame]:
+        nonlocal syncs
         for frame in frames:
             missing.discard(frame.id)
+            syncs += frame.id == canopen.SYNC
             yield frame
 
-    ticks = [tick for tick in read_telemetry(machine, noted()) if tick.driving]
+    whole = [*read_telemetry(machine, noted())]
+    ticks = [tick for tick in whole if tick.driving]
     require(not missing, "log", wanted, f"none with {identifiers(missing)}")
     time = np.array([tick.time for tick in ticks])
     u = np.reshape([tick.u for tick in ticks], (-1, machine.n))
     q = np.reshape([tick.q for tick in ticks], (-1, machine.n))
     reach = FASTER * machine.q_dot_max * machine.dt + NOISE  # of an angle in a tick
-    gap = np.abs(np.diff(time) * machine.rate - 1) >= 0.5
+    late = np.diff(time) * machine.rate  # ticks
+    gap = np.abs(late - 1) >= 0.5
     jump = (np.abs(np.diff(q, axis=0)) > reach).any(axis=1)
     pieces = np.split(np.arange(len(ticks)), np.flatnonzero(gap | jump) + 1)
     longest, least = max(map(len, pieces)), machine.history + 2
     wanted = f"{least} ticks of driving in a row at {machine.rate:g} Hz (--machine)"
-    require(longest >= least, "log", wanted, f"{longest} at most")
+    got = f"{longest} at most ({syncs} SYNCs; after {len(whole)} of them one position of each joint"
+    got = f"{got}, in {len(ticks)} of these an enabled valve frame)"
+    require(longest >= least, "log", wanted, got)
     long = [rows for rows in pieces if len(rows) >= least]
-    return machine_log(machine, [(f"drive_{k:03d}", u[i], q[i]) for k, i in enumerate(long)])
+    log = machine_log(machine, [(f"drive_{k:03d}", u[i], q[i]) for k, i in enumerate(long)])
+    lost = time[:-1][gap & (late < LOST * machine.rate)]
+    got = f"{len(lost)} gaps, the first after {min(lost, default=0):.2f} s: are frames lost?"
+    told = (f"log: expected positions and a valve frame in each tick of a drive, got {got}",)
+    return log._replace(warnings=told if len(lost) else ())

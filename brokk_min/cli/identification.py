@@ -73,7 +73,8 @@ class ReadsLogs(Command):
         if is_table(path):
             return logs.read_log(path, machine, columns.parse_map(self.map), self.topics)
         with expected(path, "a log"):
-            return log_for_fit(machine, read_frames(path))
+            log = log_for_fit(machine, read_frames(path))
+            return log._replace(warnings=tuple(f"{path}: {one}" for one in log.warnings))
 
 
 @dataclass(kw_only=True)
@@ -139,10 +140,15 @@ class Fit(ReadsLogs):
                 twins = inspection.repeated(test.recordings, log.recordings)
                 require(not twins, "--test", "recordings that LOGS has not", brief(twins))
                 validation.scored_steps(test, machine.history)  # now, not after the search below
-            every = log._replace(recordings=(*log.recordings, *test.recordings))
+            every, fitted = (
+                logs.join_logs({Path("LOGS"): log, Path("--test"): test}),
+                len(log.recordings),
+            )
+            log = every._replace(recordings=every.recordings[:fitted])
+            test = every._replace(recordings=every.recordings[fitted:])
         reports = inspection.inspect(every, known)
-        for wrong in (*inspection.wrong_signs(reports), *inspection.mixed_up(reports)):
-            raise ValueError(f"{self.logs[0]}: {wrong}")
+        for wrong in (*inspection.mixed_up(reports), *inspection.wrong_signs(reports)):
+            raise ValueError(f"{self.logs[0] if len(self.logs) == 1 else 'LOGS'}: {wrong}")
         resting = inspection.resting(reports)
         with expected(self.logs[0], "a log to fit to"):
             log = logs.without(log, resting)

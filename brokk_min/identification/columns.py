@@ -19,7 +19,13 @@ from brokk_min.machine import Array, require
 
 UNITS = {"deg": math.pi / 180, "mrad": 1e-3, "mm": 1e-3, "percent": 1e-2, "permille": 1e-3}
 # of commands, by the largest number in them
-COMMAND_UNITS = {100: "percent or :0.00787", 127: "0.00787", 255: "UNIT", 1000: "permille"}
+COMMAND_UNITS = {
+    10: "0.1 or percent",
+    100: "percent or :0.00787",
+    127: "0.00787",
+    255: "UNIT",
+    1000: "permille",
+}
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # beside folders of ROS
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
@@ -99,7 +105,8 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
         moments = numbers(path, name, values, _moment, "an ISO stamp")
         values = (moments - moments[0]) / timedelta(seconds=1)
     elif values.dtype.kind in "US":
-        values = numbers(path, name, values)
+        angle = name.startswith("q_")  # as pandas writes nan
+        values = numbers(path, name, np.where(values == "", "nan", values) if angle else values)
     if name == "time" and factor != 1:
         values = values - values[:1]  # keeps its digits
     result: Array = np.asarray(values * factor, float)

@@ -43,6 +43,8 @@ USUALLY, SOUND = 4.0, 0.6  # so many times the quantile of the log's, of sound o
 SEVERAL = 5  # recordings tell what is usual
 AT_LEAST = (0.9, 0.3)  # s, if less or more of the motion is explained than
 WELL = 0.9  # as without noise, without coarse steps, and where valves open at once
+SHORTEST = 5.0  # s, of a recording whose sign is looked at
+STARTS = 1.0  # s at the beginning of one that begins in motion, which do not count
 RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
 SAME, ROUNDED = 20, 1e-3  # samples of the same commands, and rad, up to which motion is the same
 # What a log must have, all assumed.
@@ -83,6 +85,7 @@ class JointReport(NamedTuple):
     opposite: list[str]  # recordings in which the sign is not that of most of them
     follows: dict[str, float]  # rad/s per rad/s of joints with which it moves without commands
     other: str = ""  # the joint whose commands explain its motion
+    idle: tuple[str, ...] = ()  # recordings in which it moves without commands
     rest: float = 0.0  # the command at which it rests, if that is clearly not 0
     one_size: bool = False  # are all commands in a direction of one size?
     early: float = 0.0  # s, by which it moves before its commands, if that explains more
@@ -113,7 +116,8 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     turned = opposite(recordings, j, rate)
     q_dot = np.concatenate([one.q_dot[:, j] for one in kept])
     steps = np.abs(np.diff(q))
-    opens = (model.gains != 0) & (model.zones < ZONES[-1])
+    switched = one_size(u)
+    opens = (model.gains != 0) & (model.zones < ZONES[-1]) & (not switched)
     dead_zone = np.where(opens, model.zones, np.nan)
     by = {
         name: fit_model(motion_of(kept, j, rate, span, i)).explained
@@ -122,7 +126,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     }
     other = max(by, key=lambda name: by[name], default="")
     driven = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
-    second = means(motion, motion.u, 1.0)
+    second = means(every := motion_of(recordings, j, rate, span), every.u, 1.0)
     coarse = (means(motion, x, COARSE) for x in (motion.velocity, expected_velocity(motion, model)))
     return JointReport(
         minutes=driven / rate / 60,
@@ -138,7 +142,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         dead_zone=(dead_zone[0], dead_zone[1]),
         step=float(np.median(steps[steps > 0])) if steps.any() else 0.0,
         by_zones=best_lag(motion, np.array(zones)).explained if zones else 1.0,
-        still=still,
+        still=[] if switched and len(still) < len(recordings) else still,
         opposite=[
             one.name
             for one, of in zip(recordings, each)
@@ -146,8 +150,9 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         ],
         follows={},
         other=other if by.get(other, 0) > LEAST_EXPLAINED else "",
+        idle=idle(recordings, j, rate),
         rest=rest_of(motion_of(list(log.recordings), j, rate, span)),
-        one_size=one_size(u),
+        one_size=switched,
         early=earlier(motion, model),
     )
 
@@ -168,11 +173,24 @@ def opposite(recordings: Sequence[Recording], j: int, rate: float) -> list[str]:
     names, signs = [], []
     for one in recordings:
         u, q, q_dot = one.u[:, j], one.q[:, j], one.q_dot[:, j]
-        if np.ptp(u) > COMMANDED and np.ptp(q) > MOVED:
+        if len(u) > SHORTEST * rate and np.ptp(u) > COMMANDED and np.ptp(q) > MOVED:
             names.append(one.name)  # less the means, because a joint may sag all the time
             signs.append(sign(u - u.mean(), q_dot - q_dot.mean(), rate, OPPOSITE))
     fewer = -np.sign(sum(signs)) or 1
     return [name for name, way in zip(names, signs) if way == fewer] if -fewer in signs else []
+
+
+def idle(recordings: Sequence[Recording], j: int, rate: float) -> tuple[str, ...]:
+    """Names of the recordings in which joint `j` moves clearly and has no commands."""
+    half = round(COARSE * rate)
+    each = [np.cumsum(one.q[:, j] - one.q[0, j]) / half for one in recordings]
+    # from the mean of half a second to that of the next one, in which noise does not count
+    moved = [
+        np.abs(x[2 * half :] - 2 * x[half:-half] + x[: -2 * half]).max(initial=0) for x in each
+    ]
+    silent = [np.abs(one.u[:, j]).max() <= COMMANDED for one in recordings]
+    pairs = zip(recordings, silent, np.array(moved) > OPENS * max(moved), strict=True)
+    return tuple(one.name for one, no_command, moves in pairs if no_command and moves)
 
 
 def followed_joints(log: Log, samples: Samples, j: int) -> dict[str, float]:
@@ -200,17 +218,24 @@ class Motion(NamedTuple):
 def motion_of(
     recordings: list[Recording], j: int, rate: float, span: Pair, commands: int | None = None
 ) -> Motion:
-    """Joint `j` of recordings that begin at rest, in its range `span` [rad].
+    """Joint `j` of recordings in its range `span` [rad].
 
-    Its commands may be those of another joint.
+    Its commands may be those of another joint. Before a recording that begins in motion, as after
+    a gap, nobody knows them.
     """
     rest, of = (0, round(PAUSE * rate)), j if commands is None else commands
     u = np.concatenate([np.pad(one.u[:, of], rest) for one in recordings])
     q = np.concatenate([np.pad(one.q[:, j], rest, "edge") for one in recordings])
-    counts = np.concatenate([np.pad(np.ones(len(one.u), bool), rest) for one in recordings])
+    counts = np.concatenate([np.pad(after_start(one, j, of, rate), rest) for one in recordings])
     q_next, margin = np.append(q[1:], q[-1]), AT_STOP * (span[1] - span[0])
     counts &= (q_next > span[0] + margin) & (q_next < span[1] - margin)
     return Motion(u, (q_next - q) * rate * counts, counts, rate)
+
+
+def after_start(one: Recording, j: int, of: int, rate: float) -> NDArray[np.bool_]:
+    """Samples of a recording that count, (T,): all, or all but the first if it begins in motion."""
+    moves = abs(one.u[0, of]) > COMMANDED or abs(one.q_dot[0, j]) > MOVED
+    return np.asarray(np.arange(len(one.u)) >= (STARTS * rate if moves else 0))
 
 
 class Model(NamedTuple):
@@ -330,7 +355,9 @@ def still_seconds(motion: Motion, model: Model, others: Motion) -> float:
     signed = expected_velocity(motion, model)
     expected = np.abs(signed)
     clear = max(CLEAR * np.abs(expected_velocity(others, model)).max(), MOVED)  # rad/s
-    if expected.max() > clear and np.std(motion.velocity) < RESTS * np.std(signed):
+    if (expected > clear).sum() > AT_LEAST[1] * motion.rate and np.std(
+        motion.velocity
+    ) < RESTS * np.std(signed):
         return np.inf  # it may sag, but does not answer
     ends = reach(motion) < RESTS * clear  # of a second at rest
     rests = np.convolve(ends, np.ones(round(motion.rate)))[-len(ends) :] > 0
@@ -368,12 +395,18 @@ def contradicts(motion: Motion, model: Model) -> bool:
 
 
 def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
-    """Joints whose angle falls under positive commands in all recordings or in some, in words."""
+    """Joints whose angle falls under positive commands in all recordings or in some, in words.
+
+    Where commands of joints are mixed up, their signs say nothing.
+    """
+    mixed = {name for name, r in reports.items() if r.other} | {r.other for r in reports.values()}
     for name, report in reports.items():
+        if name in mixed or one_sided(report):
+            continue
         wanted = f"u_{name}: expected positive commands to raise q_{name}"
         if report.sign < 0:
             got = f"falling angles (--map {name}=COLUMN:-1 or :-deg; if the angle is right"
-            yield f"{wanted}, got {got}, u_{name}=COLUMN:-1)"
+            yield f"{wanted}, got {got}, u_{name}=COLUMN:-1; on a bus its encoder_sign)"
         if report.opposite:
             yield f"{wanted} in all recordings or in none, got some in {brief(report.opposite)}"
 
@@ -403,8 +436,9 @@ def causes(name: str, r: JointReport) -> Iterator[Check]:
     doubt = "is it an angle to the ground? Then take differences of both angles"
     got = f"motion at so many times the speed of others {r.follows}: {doubt}"
     yield r.follows, f"q_{name}", "rest without commands", got
-    yield r.early, name, "motion after its commands", f"it {r.early:.2f} s before: another clock?"
     yield another(name, r)
+    yield one_sided(r), f"u_{name}", "commands of both signs", "one: is the sign in another column?"
+    yield r.early, name, "motion after its commands", f"it {r.early:.2f} s before: another clock?"
     got = f"steps of {r.step:.3g} rad (of the encoder, or noise): {r.explained:.0%} of single"
     got = f"{got} ticks and {r.coarse:.0%} of {COARSE} s are explained"
     noise = r.coarse > max(r.explained + COARSER, LEAST_EXPLAINED)
@@ -417,13 +451,21 @@ def causes(name: str, r: JointReport) -> Iterator[Check]:
 
 def lacks(name: str, r: JointReport) -> Iterator[Check]:
     """What nets could not learn from a log."""
-    got = f"recordings in which it rests (engine or pump off, or blocked?): {brief(r.still)}"
-    got = f"{got}; figures and nets are of the others, if any"
+    got = f"rest or other motion in {brief(r.still)} (engine or pump off, blocked, another clock or"
+    got = f"{got} column?); figures and nets are of other recordings, if any"
     yield r.still and not r.other, name, "commands to move it", got
+    got = f"none in {brief(list(r.idle))}: is the column of another joint, or was it not recorded?"
+    missing = r.idle and not (r.follows or r.other)
+    yield missing, f"u_{name}", "commands where it moves", got
     yield r.rest, f"u_{name}", "0 at rest", f"{r.rest:.3g}"
     largest = max(r.largest)
     wanted = "commands in parts of full command, up to 1"
-    yield largest < SMALL, f"u_{name}", wanted, f"at most {largest:.2g}: another unit?"
+    yield (
+        not missing and largest < SMALL,
+        f"u_{name}",
+        wanted,
+        f"at most {largest:.2g}: another unit?",
+    )
     wanted = "commands of many sizes, because nets cannot guess what is between"
     yield r.one_size, f"u_{name}", wanted, "one in each direction"
     few = round(r.minutes, 1) < LEAST_MINUTES
@@ -438,7 +480,8 @@ def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
     turned = min(beyond(low, high, joint), beyond(-high, -low, joint)) < BEYOND * width
     turned &= r.high - r.low > 2 * width or max(-r.low, r.high) > 2 * np.pi  # else it would fit
     doubt = f"in degrees (--map {name}=COLUMN:deg, or -deg)" if turned else "another zero or joint"
-    outside = beyond(r.low, r.high, joint) > BEYOND * width
+    mirrored = r.sign < 0 and beyond(-r.high, -r.low, joint) <= BEYOND * width
+    outside = not mirrored and beyond(r.low, r.high, joint) > BEYOND * width
     yield outside, f"q_{name}", f"{joint.q_min:g} to {joint.q_max:g}", f"{got}: {doubt}?"
     narrow = r.high - r.low < LEAST_RANGE * width
     yield narrow, name, f"{LEAST_RANGE:.0%} of its range or more", got
@@ -459,6 +502,12 @@ def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
     yield r.delay + r.tau > memory, "history", wanted, f"{memory:.2f} s"
 
 
+def one_sided(r: JointReport) -> bool:
+    """Does a joint move both ways, and not by its commands, which are all of one sign?"""
+    both = min(r.fastest) > OPENS * max(r.fastest)
+    return both and min(r.largest) <= 0 and r.explained < LEAST_EXPLAINED
+
+
 def beyond(low: float, high: float, joint: Joint) -> float:
     """How far a range goes beyond that of the joint [rad]."""
     return max(joint.q_min - low, high - joint.q_max)
@@ -477,7 +526,7 @@ def warnings(
             yield f"{name}: expected commands in the log, got none"
     for name, r in reports.items():
         first = [check for check in causes(name, r) if check[0]][:1]
-        known = differences(name, r, machine) if machine else ()
+        known = differences(name, r, machine) if machine and not r.follows else ()
         for holds, place, wanted, got in (*first, *lacks(name, r), *known):
             if holds:
                 yield f"{place}: expected {wanted}, got {got}"

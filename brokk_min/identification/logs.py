@@ -7,6 +7,7 @@ are estimated, because a bus carries angles alone. Joints may have any names. Th
 below the machine's, and it may jitter.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from itertools import compress
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from brokk_min._files import brief, expected, whole_file, write_csv
 from brokk_min.fit import Log, Recording, join_recordings, moving, velocity_of
 from brokk_min.identification.columns import TOPICS, Mapped, load_table
-from brokk_min.identification.readings import check_run, left_out, pieces_of
+from brokk_min.identification.readings import check_run, left_out, longest_gap, pieces_of
 from brokk_min.identification.ros_logs import COMMAND_TIME
 from brokk_min.machine import Array, Machine, require
 
@@ -54,13 +55,19 @@ def in_order(log: Log, joints: Sequence[str]) -> Log:
 
 
 def join_logs(logs: Mapping[Path, Log]) -> Log:
-    """One log of several files, in the order of the first; ValueError: other joints, or empty."""
+    """One log of several files, in the order of the first; ValueError: other joints, or empty.
+
+    A name that two recordings have gets that of its file in front.
+    """
     first, *_ = logs.values()
     recordings: tuple[Recording, ...] = ()
     warnings: tuple[str, ...] = ()
+    names = Counter(one.name for log in logs.values() for one in log.recordings)
     for path, log in logs.items():
         with expected(path, "a log"):
-            recordings += in_order(log, first.joints).recordings
+            for one in in_order(log, first.joints).recordings:
+                name = f"{path}: {one.name}" if names[one.name] > 1 else one.name
+                recordings += (one._replace(name=name),)
         warnings += log.warnings
     require(len(recordings) > 0, ", ".join(map(str, logs)), "at least one recording", "none")
     return Log(first.joints, recordings, first.rate, warnings)
@@ -98,7 +105,7 @@ def read_log(
         u, q = (np.array([table[f"{kind}_{name}"] for name in joints]).T for kind in "uq")
         speeds = dict(zip(machine.names, machine.q_dot_max, strict=True))
         fastest = np.array([speeds.get(name, 0.0) for name in joints])
-        wrong = np.zeros(q.shape, bool)
+        wrong, gaps, longest = np.zeros(q.shape, bool), [], longest_gap(machine.rate)
         recordings = []
         unique, first, number = np.unique(table["run"], return_index=True, return_inverse=True)
         for i in np.argsort(first):
@@ -107,6 +114,7 @@ def read_log(
             held = (time, u[rows]) if COMMAND_TIME not in table else (table[COMMAND_TIME], u)
             if len(rows) > 1:
                 check_run(run, time, angles, machine.rate, joints, fastest)
+            gaps += [f"{t:g} s of {run}" for t in time[:-1][np.diff(time) > longest]]
             pieces, wrong[rows] = pieces_of(time, angles, machine.rate, fastest)
             for part, piece in enumerate(pieces):
                 skipped = machine.velocity_samples - 1 if part else 0
@@ -114,6 +122,9 @@ def read_log(
                 sampled = [x[skipped:] for x in resampled]
                 if len(sampled[0]):
                     recordings.append(Recording(f"{run}#{part + 1}" if part else run, *sampled))
+        if gaps:
+            got = f"{len(gaps)} gaps, the first after {gaps[0]}; each begins another recording"
+            told = [*told, f"time: expected rows within {longest:g} s of the one before, got {got}"]
         warnings = tuple(f"{path}: {one}" for one in (*told, *left_out(wrong, q, joints)))
         return Log(joints, tuple(recordings), machine.rate, warnings)
 

@@ -20,6 +20,7 @@ FASTER = 2.0  # times the fastest motion, as in the safety gate: no joint does i
 USUAL = 4.0  # times the 90 % quantile of noise in steps, assumed: none is beyond it
 LASTS = 5  # rows, assumed: motion that lasts for three of them is real
 TOO_FAST = 10.0  # times the fastest motion of a machine, of one that is unknown 1 rad/s (assumed)
+ANGLES = {"deg": np.pi / 180, "mrad": 1e-3}  # rad, other units of angles
 TURN = 0.3  # rad, assumed: so near 2 pi a jump is a turn
 LEAST = 10  # fast steps, assumed, that tell how often a sensor is read
 
@@ -70,10 +71,15 @@ def unread(time: Array, q: Array, fastest: float) -> NDArray[np.bool_]:
         return jump
     between = np.cumsum(jump)  # number of jumps up to each row
     shortest = max(3 * rows_per_value(q), MAX_GAP / float(np.median(np.diff(time))))
+    short = np.bincount(between)[between] < shortest
+    others = np.flatnonzero(~short)
+    if short.any() and len(others) > 1:  # without these, the others may be one motion
+        short[others] = unread(time[others], q[others], fastest)
+        return short
     begins = np.flatnonzero(np.diff(between, prepend=-1))
     still = np.maximum.reduceat(q, begins) == np.minimum.reduceat(q, begins)
     still &= not still.all()  # of a joint that moves
-    return np.asarray((np.bincount(between)[between] < shortest) | still[between])
+    return np.asarray(short | still[between])
 
 
 def check_run(
@@ -106,8 +112,10 @@ def check_run(
         speeds = np.nan_to_num(np.abs(q[lag:] - q[:-lag])) / (time[lag:] - time[:-lag])[:, None]
         usual, limit = np.quantile(speeds, 0.9, axis=0), TOO_FAST * np.where(fastest, fastest, 1.0)
         for name, speed, most in zip(joints, usual, limit, strict=True):
+            plausible = FASTER * most / TOO_FAST
+            unit = next((x for x, rad in ANGLES.items() if rad * speed <= plausible), "UNIT")
             got = f"{speed:.3g} in {time[-1] - time[0]:.3g} s altogether"
-            doubt = f"another unit (--map time=COLUMN:UNIT, or {name}=COLUMN:deg)?"
+            doubt = f"another unit (--map time=COLUMN:UNIT, or {name}=COLUMN:{unit})?"
             wanted = f"speeds of q_{name} up to {most:.3g} rad/s"
             require(speed <= most, f"run {run}, column time", wanted, f"{got}: {doubt}")
 
@@ -126,11 +134,16 @@ def pieces_of(
         known = np.flatnonzero(~bad[:, j])
         bad[known, j] = unread(time[known], angle[known], speed)
     good = np.flatnonzero(~bad.any(axis=1))
-    gap = np.diff(time[good]) > max(MAX_GAP, 2.5 / rate)
+    gap = np.diff(time[good]) > longest_gap(rate)
     cuts = np.zeros_like(bad)
     cuts[good] = np.stack([jumps(time[good], angle[good], speed) for angle, speed in each], axis=1)
     pieces = np.split(good, np.flatnonzero(gap | cuts[good[1:]].any(axis=1)) + 1)
     return [piece for piece in pieces if len(piece)], bad | cuts
+
+
+def longest_gap(rate: float) -> float:
+    """The longest time between two rows of one recording [s]."""
+    return max(MAX_GAP, 2.5 / rate)
 
 
 def left_out(wrong: NDArray[np.bool_], q: Array, joints: Sequence[str]) -> Iterator[str]:
@@ -139,8 +152,11 @@ def left_out(wrong: NDArray[np.bool_], q: Array, joints: Sequence[str]) -> Itera
     for name, bad, angle in zip(joints, wrong.T, q.T, strict=True):
         if bad.any():
             row = int(bad.argmax())
-            alike.setdefault((row, f"{angle[row]:.4g}", bad.sum()), []).append(f"q_{name}")
-    for (row, angle, rows), names in alike.items():
-        got = f"a jump to {angle} (was the sensor not read?) in {rows} rows"
+            turn = abs(abs(angle[row] - angle[row - 1]) - 2 * np.pi) < TURN
+            doubt = "by a turn: unwrap it" if turn else "was the sensor not read?"
+            got = f"a jump to {angle[row]:.4g} ({doubt})"
+            alike.setdefault((row, got, bad.sum()), []).append(f"q_{name}")
+    for (row, got, rows), names in alike.items():
+        got = f"{got} in {rows} rows"
         what = "which are left out or begin a new recording"
         yield f"row {row + 2}: expected motion of {', '.join(names)}, got {got}, {what}"

@@ -1,11 +1,13 @@
 """Recordings of ROS (rosbag2 folders, `.mcap`, `.db3`, and `.bag` of ROS 1) as tables.
 
-Angles are in `sensor_msgs/JointState`, commands in another JointState (its first filled field) or
-in a `std_msgs/Float64MultiArray` in the order of the angles. Several nodes may send each. A command
-holds from its own stamp on. Stamps are those of the headers, moved to the recorder's clock by the
-message that was least late, or else the recorder's, which have the delays of the network in them.
+Angles are in `sensor_msgs/JointState`, commands in another JointState (its first field with other
+numbers than 0) or in a `std_msgs/Float64MultiArray` in the order of the angles. Several nodes may
+send each. A command holds from its own stamp on. Stamps are those of the headers, moved to the
+recorder's clock by the message that was least late, or else the recorder's, which have the delays
+of the network in them.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +52,8 @@ def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], li
         states, orders = [message for _, message in found[angles]], [m for _, m in found[commands]]
         names = [*dict.fromkeys(name for state in states for name in state.name)]
         q = [(t, joints_of(state, names, FIELDS[:1])) for t, state in zip(times, states)]
-        u = [(t, joints_of(order, names, FIELDS)) for t, order in zip(u_times, orders)]
+        used = [x for x in FIELDS if any(np.any(getattr(order, x, 0)) for order in orders)]
+        u = [(t, joints_of(order, names, used or FIELDS)) for t, order in zip(u_times, orders)]
         table = columns_of(q, u)
     several = hasattr(orders[0], "data") and any([*state.name] != names for state in states)
     order = [f"{commands}: expected one order of the joints, took {names}"] if several else []
@@ -75,16 +78,19 @@ def clock(topic: str, messages: list[tuple[float, Any]]) -> tuple[Array, list[st
     return stamps + least.min(), [told] if usual > LATE else []
 
 
-def joints_of(message: Any, names: list[str], fields: tuple[str, ...]) -> dict[str, float]:
+def joints_of(message: Any, names: list[str], fields: Sequence[str]) -> dict[str, float]:
     """Angles or commands by joint, those of the first of `fields` that is filled, or none.
 
     ValueError: other numbers of them than of joints.
     """
     if hasattr(message, "data"):
         wanted = f"one of each {names} (a JointState says by itself which joints it has)"
-        require(len(message.data) == len(names), "commands", wanted, brief([*message.data]))
+        got = brief([*map(float, message.data)])
+        require(len(message.data) == len(names), "commands", wanted, got)
         return dict(zip(names, message.data, strict=True))
     filled = [x for x in (getattr(message, field) for field in fields) if len(x)]
+    named = not filled or len(filled[0]) == len(message.name)
+    require(named, "names", f"one of each {brief([*filled[:1]])}", brief([*message.name]))
     return dict(zip(message.name, filled[0], strict=True)) if filled else {}
 
 

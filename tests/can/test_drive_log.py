@@ -116,7 +116,11 @@ def test_log_for_fit__by_hand():
         unread[k] = frames[k]._replace(data=struct.pack("<I", 3000))
     (long,) = log_for_fit(machine, unread).recordings  # 16 after the second one, 14 before it
     np.testing.assert_allclose(long.q[:, 0], (np.arange(120, 136)) * STEP)
-    refusal = r"15 ticks of driving in a row at 10 Hz \(--machine\), got 11 at most"
+    assert "got 2 gaps, the first after 101.40 s: are frames lost?" in log.warnings[0]
+    refusal = (
+        r"15 ticks of driving in a row at 10 Hz \(--machine\), got 11 at most \(12 SYNCs; after "
+    )
+    refusal += "11 of them one position of each joint, in 11 of these an enabled valve frame"
     with pytest.raises(ValueError, match=refusal):
         log_for_fit(machine, frames[:100])
     other = replace(machine, valve_frame_id=0x211)

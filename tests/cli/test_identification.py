@@ -97,7 +97,7 @@ def test_fit__leaves_out_recordings_in_which_nothing_moves(tmp_path, capsys):
         write_log(tmp_path / f"{name}.csv", moving._replace(recordings=recordings))
         assert run(f"fit {TINY}", tmp_path / f"{name}.csv", "--out", tmp_path / f"{name}.npz") == 0
     told = capsys.readouterr().out
-    assert "rests (engine or pump off, or blocked?): ['take 0', 'take 1']" in told
+    assert "got rest or other motion in ['take 0', 'take 1'] (engine or pump off" in told
     nets = [load_net(tmp_path / f"{name}.npz") for name in logs]
     assert all(map(np.array_equal, *(net.weights for net in nets)))
     write_log(tmp_path / "rests.csv", moving._replace(recordings=(stands[0],)))

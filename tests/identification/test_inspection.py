@@ -159,6 +159,16 @@ GOOD = JointReport(
         ({"explained": 0.05, "coarse": 0.1}, ["q1: expected 60% of its motion .*, got 5%"]),
         ({"explained": 0.4}, ["q_q1: expected angles finer than .* steps of 0.01 rad"]),
         ({"explained": 0.4, "other": "q3"}, ["q1: expected motion by u_q1, got motion by u_q3"]),
+        (
+            {"explained": 0.4, "other": "q3", "sign": -1, "early": 0.2},
+            ["q1: .* got motion by u_q3"],
+        ),
+        (
+            {"explained": 0.1, "coarse": 0.1, "largest": (0.5, 0.0), "opposite": ["x"]},
+            ["u_q1: expected commands of both signs, got one"],
+        ),
+        ({"idle": ("x",)}, ["u_q1: expected commands where it moves, got none in .'x'."]),
+        ({"sign": -1, "low": -2.1, "high": 1.9}, ["u_q1: .* on a bus its encoder_sign"]),
         ({"delay": 0.6}, ["q1: expected motion within 0.6 s", "history: .*, got 0.65 s"]),
         ({"still": ["x"]}, ["q1: expected commands to move it, got .* .'x'."]),
         ({"rest": 0.1}, ["u_q1: expected 0 at rest, got 0.1"]),
@@ -217,6 +227,35 @@ def test_inspect__names_recordings_in_which_commands_do_not_move_the_joint(share
     assert (everywhere.still == ["0"]) == (share == 0)
 
 
+def test_inspect__knows_that_after_a_gap_a_joint_is_in_motion():
+    """Pieces of 3 s, of joints that are driven all the time."""
+    each = [record("boom", u) for u in SEVEN]
+    pieces = [
+        Recording(f"{i}#{k}", *(x[k : k + 60] for x in one[1:]))
+        for i, one in enumerate(each)
+        for k in range(0, 720, 65)
+    ]
+    report = inspect(log_of(*pieces))["boom"]
+    assert report.delay == inspect(log_of(*each))["boom"].delay == pytest.approx(0.1)
+    assert report.still == report.opposite == [] and report.early == 0
+
+
+def test_inspect__names_recordings_without_commands():
+    """Not those in which a joint that is not driven has a noisy angle."""
+    lost = boom(*SEVEN, change=lambda one: one._replace(u=0 * one.u))
+    assert lost.idle == ("0", "3", "6") and boom(*SEVEN).idle == ()
+    noise = np.random.default_rng(0).normal(0, 0.02, (800, 2))
+    parked = record("arm", SEVEN[0])._replace(name="parked")
+    parked = parked._replace(q=parked.q + noise, q_dot=parked.q_dot + 20 * noise)
+    assert inspect(log_of(*(record("boom", u) for u in SEVEN), parked))["boom"].idle == ()
+
+
+def test_inspect__does_not_name_a_recording_for_its_last_samples():
+    """Of four of them a valve that was closed does not open."""
+    last = np.append(np.full(200, 0.05), [0.5, 0.5, -0.5, 0.5])
+    assert boom(*SEVEN, last).still == []
+
+
 def test_inspect__names_short_stalls_and_a_joint_that_sags():
     """Neither is taken for a wrong sign, nor is a joint that rests, whose velocity is rounding."""
 
@@ -268,6 +307,7 @@ def test_inspect__knows_commands_at_rest_and_switches():
     assert inspect(log_of(*parked, *arm))["boom"].rest == pytest.approx(0.15)  # parked
     switched = boom(*(np.sign(u) for u in pauses))
     assert switched.one_size and switched.rest == 0.0
+    assert np.isnan(switched.dead_zone).all() and switched.still == []
     sound = boom(*pauses)
     assert not sound.one_size and sound.rest == 0.0
     upwards = boom(*(np.abs(u) for u in SEVEN))  # it rests under commands within the dead zone

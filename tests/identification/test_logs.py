@@ -84,6 +84,8 @@ def test_read_log__cuts_a_recording_at_gaps_and_assumes_no_rest_after_them(tmp_p
     np.testing.assert_allclose(second.q_dot, 0.3, atol=1e-9)
     np.testing.assert_allclose(second.u[:, 0], columns["u_a"][66:86])
     assert first.q_dot[0, 0] == 0.0  # at rest before a recording
+    (told,) = read_columns(tmp_path, columns, machine).warnings
+    assert "within 0.25 s of the one before, got 2 gaps, the first after 3.1 s of x" in told
 
 
 def test_join_logs__joins_files_of_the_same_joints_only():
@@ -93,6 +95,8 @@ def test_join_logs__joins_files_of_the_same_joints_only():
     assert log.joints == ("a", "b") and [one.name for one in log.recordings] == ["x", "z"]
     np.testing.assert_array_equal(log.recordings[1][1:], np.flip(z[1:], axis=-1))
     assert log.warnings == ("row",)
+    log = logs.join_logs(files | {Path("4"): Log(("a", "b"), (x,))})
+    assert [one.name for one in log.recordings] == ["1: x", "z", "4: x"]
     with pytest.raises(ValueError, match=r"^3: joints: expected \['a', 'b'\], got \['a', 'c'\]"):
         logs.join_logs(files | {Path("3"): Log(("a", "c"), (x,))})
 
@@ -142,7 +146,9 @@ def test_read_log__leaves_out_readings_that_no_motion_explains(tmp_path, wrong, 
     assert "log.npz: row 62: expected motion of q_b" in log.warnings[1]
     columns["q_a"][:], columns["q_b"][:3] = columns["q_b"], np.nan
     columns["q_a"][:3] = np.nan
-    told = "log.npz: row 2: expected motion of q_a, q_b, got a jump to nan"
+    told = (
+        "log.npz: row 2: expected motion of q_a, q_b, got a jump to nan (was the sensor not read?)"
+    )
     assert read_columns(tmp_path, columns, machine).warnings[0].startswith(str(tmp_path / told))
 
 
@@ -154,6 +160,22 @@ def test_read_log__keeps_the_readings_of_a_noisy_sensor(tmp_path):
     assert read_columns(tmp_path, columns).warnings == ()
 
 
+def test_read_log__knows_an_angle_that_a_parked_joint_keeps_between_two_unread_ones(tmp_path):
+    columns = swinging()
+    columns["q_b"][50::40] = 0.0
+    columns["q_b"][100:140] = -0.4  # exactly, not with noise
+    (told,) = read_columns(tmp_path, columns).warnings
+    assert "row 52: expected motion of q_b, got a jump to 0 (" in told and " in 8 rows, " in told
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(180 / np.pi, "deg"), (1e3, "mrad"), (1e6, "UNIT")])
+def test_read_log__guesses_the_unit_of_angles(tmp_path, scale, unit):
+    columns = swinging()
+    columns["q_a"] *= scale
+    with pytest.raises(ValueError, match=rf"another unit \(--map .*, or a=COLUMN:{unit}\)\?"):
+        read_columns(tmp_path, columns)
+
+
 @pytest.mark.parametrize("change", [0.6, -2 * np.pi])
 def test_read_log__cuts_where_the_zero_of_an_angle_changes(tmp_path, change):
     columns = swinging()
@@ -161,6 +183,7 @@ def test_read_log__cuts_where_the_zero_of_an_angle_changes(tmp_path, change):
     log = read_columns(tmp_path, columns)
     assert [len(one.q) for one in log.recordings] == [200, 200 - 3]
     assert "row 202: expected motion of q_a" in log.warnings[0]
+    assert ("by a turn: unwrap it" in log.warnings[0]) == (change != 0.6)
     assert (speed_of(log) < 0.6).all()
 
 
@@ -192,6 +215,9 @@ def test_read_log__takes_semicolons_with_decimal_commas(tmp_path):
     (tmp_path / "b.csv").write_text(GOOD.replace(",", ";").replace(".", ","))
     one, other = (read_log(tmp_path / name, BROKK_170) for name in ("a.csv", "b.csv"))
     np.testing.assert_equal(one.recordings, other.recordings)
+    (tmp_path / "c.csv").write_text(GOOD.replace("1.2", ""))  # as pandas writes nan
+    (told,) = read_log(tmp_path / "c.csv", BROKK_170).warnings
+    assert "row 4: expected motion of q_a, got a jump to nan" in told
 
 
 @pytest.mark.parametrize(
@@ -202,6 +228,10 @@ def test_read_log__takes_semicolons_with_decimal_commas(tmp_path):
         (
             GOOD.replace("0.3", "30"),
             "row 4, column u_a: expected -1 to 1 (another unit? --map u_a=COLUMN:percent or :0.0",
+        ),
+        (
+            GOOD.replace("0.3", "3"),
+            "row 4, column u_a: expected -1 to 1 (another unit? --map u_a=CO",
         ),
         (GOOD.replace("0.3", "nan"), "row 4, column u_a: expected -1 to 1, got nan"),
         (GOOD.replace("0.10", "0.05"), "run x, column time: expected stamps that rise, got a step"),

@@ -105,6 +105,17 @@ def test_read_ros__leaves_out_empty_messages_and_stamps_that_nobody_has_set(tmp_
         read_ros(tmp_path, "/joint_states", "/valves")
 
 
+def test_read_ros__takes_the_field_with_commands_and_names_a_message_that_does_not_fit(tmp_path):
+    def filled(k):
+        return joint_state(["arm", "boom"], [0.0, 0.0], velocity=(-k / 40, k / 20))
+
+    table, _ = read_ros(record(tmp_path / "bag", drive(filled)), "/joint_states", "/valves")
+    np.testing.assert_allclose(table["u_boom"], np.arange(0, 20, 2) / 20)
+    path = record(tmp_path / "short", drive(lambda k: joint_state(["arm"], [0.1, 0.2])))
+    with pytest.raises(ValueError, match=r"names: expected one of each .*, got \['arm'\]"):
+        read_ros(path, "/joint_states", "/valves")
+
+
 def test_read_ros__warns_of_a_command_that_holds_for_long(tmp_path):
     messages = drive(lambda k: multi_array([0.5, 0.0, 0.5]))
     later = [(t + 3, topic, message) for t, topic, message in messages]
