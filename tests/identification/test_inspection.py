@@ -229,7 +229,8 @@ def test_inspect__names_recordings_in_which_commands_do_not_move_the_joint(share
 
 def test_inspect__knows_that_after_a_gap_a_joint_is_in_motion():
     """Pieces of 3 s, of joints that are driven all the time."""
-    each = [record("boom", u) for u in SEVEN]
+    slow = 0.6 * np.sin(2 * np.pi * 0.1 * np.arange(800) / 20)
+    each = [record("boom", u) for u in (*SEVEN[:2], slow, -slow)]
     pieces = [
         Recording(f"{i}#{k}", *(x[k : k + 60] for x in one[1:]))
         for i, one in enumerate(each)
@@ -251,9 +252,11 @@ def test_inspect__names_recordings_without_commands():
 
 
 def test_inspect__does_not_name_a_recording_for_its_last_samples():
-    """Of four of them a valve that was closed does not open."""
-    last = np.append(np.full(200, 0.05), [0.5, 0.5, -0.5, 0.5])
-    assert boom(*SEVEN, last).still == []
+    """In 0.3 s a valve that was closed does not open."""
+    last = record("boom", np.append(np.full(200, 0.05), np.full(6, -0.6)))
+    last = last._replace(name="last", q=0.02 + 0 * last.q, q_dot=0 * last.q_dot)
+    log = log_of(*(record("boom", u) for u in SEVEN), last._replace(q=last.q + 1e-4 * last.u))
+    assert inspect(log)["boom"].still == []
 
 
 def test_inspect__names_short_stalls_and_a_joint_that_sags():
