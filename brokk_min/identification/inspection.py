@@ -254,7 +254,9 @@ def fit_model(motion: Motion) -> Model:
         best = best_lag(motion, zones)
         for side in (0, 1):
             trials = [np.where(np.arange(2) == side, zone, zones) for zone in ZONES]
-            models = (with_gains(motion, best.lag, trial) for trial in trials)
+            delay, tau = best.lag
+            each = ((trial, responses(motion, tau, trial)) for trial in trials)
+            models = (with_gains(motion, (delay, tau), trial, x) for trial, x in each)
             best = max(models, key=lambda one: one.explained)
             zones = best.zones
     return best
@@ -262,8 +264,10 @@ def fit_model(motion: Motion) -> Model:
 
 def best_lag(motion: Motion, zones: Array) -> Model:
     """The delay and lag that explain a motion best with these dead zones (2,)."""
+    x = {tau: responses(motion, tau, zones) for tau in TAUS}
     lags = product(range(round(LATEST * motion.rate) + 1), TAUS)
-    return max((with_gains(motion, lag, zones) for lag in lags), key=lambda one: one.explained)
+    models = (with_gains(motion, lag, zones, x[lag[1]]) for lag in lags)
+    return max(models, key=lambda one: one.explained)
 
 
 def earlier(motion: Motion, model: Model) -> float:
@@ -277,12 +281,15 @@ def earlier(motion: Motion, model: Model) -> float:
     return ahead[best] / motion.rate if parts[best] > model.explained + EARLIER else 0.0
 
 
-def with_gains(motion: Motion, lag: tuple[int, float], zones: Array) -> Model:
-    """The model with the best gains."""
-    x = responses(motion, lag, zones)[:, motion.counts]
-    velocity = motion.velocity[motion.counts]
-    gains = np.linalg.solve(x @ x.T + 1e-9 * np.eye(2), x @ velocity)
-    return Model(explained_part(velocity, gains @ x), lag, zones, gains)
+def with_gains(motion: Motion, lag: tuple[int, float], zones: Array, x: Array) -> Model:
+    """The model with the best gains of the responses `x` (2, T), which are without the delay.
+
+    Least squares of v = g x: with A = x x^T and b = x v, g = A^-1 b leaves v^2 - g (2 b - A g).
+    """
+    x = delayed(x, lag[0]) * motion.counts
+    A, b = x @ x.T + 1e-9 * np.eye(2), x @ motion.velocity
+    gains, power = np.linalg.solve(A, b), float(motion.velocity @ motion.velocity)
+    return Model(float(gains @ (2 * b - A @ gains)) / power if power else 0.0, lag, zones, gains)
 
 
 def explained_part(velocity: Array, expected: Array) -> float:
@@ -291,18 +298,22 @@ def explained_part(velocity: Array, expected: Array) -> float:
     return 1 - float(error @ error) / power if power else 0.0
 
 
-def responses(motion: Motion, lag: tuple[int, float], zones: Array) -> Array:
-    """Velocities (2, T) upwards and downwards if the gains are 1."""
-    (delay, tau), (up, down) = lag, zones
-    late = np.concatenate([np.zeros(delay), motion.u])[: len(motion.u)]
-    openings = np.stack([np.maximum(late - up, 0), -np.maximum(-late - down, 0)])
+def responses(motion: Motion, tau: float, zones: Array) -> Array:
+    """Velocities (2, T) upwards and downwards if the gains are 1 and nothing is late."""
+    openings = [np.maximum(motion.u - zones[0], 0), -np.maximum(-motion.u - zones[1], 0)]
     a = np.exp(-1 / (motion.rate * tau))
     return np.asarray(lfilter([1 - a], [1, -a], openings))
 
 
+def delayed(x: Array, delay: int) -> Array:
+    """Responses (2, T), `delay` samples later."""
+    return np.pad(x, ((0, 0), (delay, 0)))[:, : x.shape[1]]
+
+
 def expected_velocity(motion: Motion, model: Model) -> Array:
     """What the model says of a motion [rad/s] (T,), 0 where samples do not count."""
-    return np.asarray(model.gains @ responses(motion, model.lag, model.zones) * motion.counts)
+    x = delayed(responses(motion, model.lag[1], model.zones), model.lag[0])
+    return np.asarray(model.gains @ x * motion.counts)
 
 
 def means(motion: Motion, values: ArrayLike, seconds: float) -> Array:

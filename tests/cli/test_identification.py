@@ -89,8 +89,8 @@ def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys)
 
 
 def test_fit__leaves_out_recordings_in_which_nothing_moves(tmp_path, capsys):
-    """In two of eight the pump is off; without one joint's tests its scores are not printed."""
-    moving = read_log(foreign_log(tmp_path / "log.csv", 0, 8), BROKK_170)
+    """In two of six the pump is off; without one joint's tests its scores are not printed."""
+    moving = read_log(foreign_log(tmp_path / "log.csv", 0, 6), BROKK_170)
     stands = [one._replace(q=0 * one.q + one.q[0], q_dot=0 * one.q) for one in moving.recordings]
     logs = {"sound": moving.recordings[2:], "off": (*stands[:2], *moving.recordings[2:])}
     for name, recordings in logs.items():
