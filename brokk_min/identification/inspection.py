@@ -29,6 +29,8 @@ LATEST = 0.6  # s, longest delay
 TAUS = (0.05, 0.1, 0.2, 0.4)  # s
 ZONES = 0.01 * np.arange(61)  # dead zones, of full command
 AT_STOP = 0.01  # of the recorded range: so near its end a joint may be at a stop
+STAYS = 0.125  # of the time at an end, with commands away from there: it is no stop
+MOVES_STOP = 0.1  # of it, by which a stop may be elsewhere in a recording, as after a new zero
 AGAINST = 0.4  # least correlation with the other sign of what is expected
 PAUSE = 2.0  # s, after so long a joint without commands is at rest
 CLEAR_SIGN = 0.1  # least correlation that has a clear sign
@@ -49,6 +51,7 @@ RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest t
 SAME, ROUNDED = 20, 1e-3  # samples of the same commands, and rad, up to which motion is the same
 # What a log must have, all assumed.
 LEAST_MINUTES = 10.0
+TOLD = 0.3  # minutes; less tells no dead zone
 LEAST_RANGE = 0.7  # of a joint's range
 LEAST_EXPLAINED = 0.6  # of a joint's motion by its commands; of sound logs of ours 0.84
 BEYOND = 0.05  # of a joint's range, outside of it
@@ -110,10 +113,12 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     """
     rate = log.rate
     u, q = (np.concatenate([x[:, j] for x in of]) for of in list(zip(*recordings))[1:3])
-    span = (q.min(), q.max())
-    each = [motion_of([one], j, rate, span) for one in recordings]
-    kept, motion, model, still = without_still(recordings, each, j, rate, span)
     turned = opposite(recordings, j, rate)
+    others = [one for one in recordings if one.name not in turned]
+    angles = np.concatenate([one.q[:, j] for one in others])
+    span = (angles.min(), angles.max())
+    each = [motion_of([one], j, rate, span) for one in others]
+    kept, motion, model, still = without_still(others, each, j, rate, span)
     q_dot = np.concatenate([one.q_dot[:, j] for one in kept])
     steps = np.abs(np.diff(q))
     switched = one_size(u)
@@ -130,8 +135,8 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     coarse = (means(motion, x, COARSE) for x in (motion.velocity, expected_velocity(motion, model)))
     return JointReport(
         minutes=driven / rate / 60,
-        low=span[0],
-        high=span[1],
+        low=q.min(),
+        high=q.max(),
         fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
         largest=(second.max(), -second.min()),
         sign=sign(np.concatenate([one.u[:, j] for one in kept]), q_dot, rate),
@@ -145,8 +150,8 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         still=[] if switched and len(still) < len(recordings) else still,
         opposite=[
             one.name
-            for one, of in zip(recordings, each)
-            if one.name in turned or contradicts(of, model)
+            for one in recordings
+            if one.name in turned or contradicts(motion_of([one], j, rate, span), model)
         ],
         follows={},
         other=other if by.get(other, 0) > LEAST_EXPLAINED else "",
@@ -227,9 +232,26 @@ def motion_of(
     u = np.concatenate([np.pad(one.u[:, of], rest) for one in recordings])
     q = np.concatenate([np.pad(one.q[:, j], rest, "edge") for one in recordings])
     counts = np.concatenate([np.pad(after_start(one, j, of, rate), rest) for one in recordings])
-    q_next, margin = np.append(q[1:], q[-1]), AT_STOP * (span[1] - span[0])
-    counts &= (q_next > span[0] + margin) & (q_next < span[1] - margin)
+    q_next, lengths = np.append(q[1:], q[-1]), [len(one.u) + rest[1] for one in recordings]
+    each = [stops_of(one.q[:, j], one.u[:, of], span, rate) for one in recordings]
+    stops = np.repeat(each, lengths, axis=0)
+    counts &= (q_next > stops[:, 0]) & (q_next < stops[:, 1])
     return Motion(u, (q_next - q) * rate * counts, counts, rate)
+
+
+def stops_of(q: Array, u: Array, span: Pair, rate: float) -> Pair:
+    """Angles [rad] beyond which a joint may be at a stop in a recording (T,).
+
+    The ends of its own angles may be stops, too, if commands away from there move it away.
+    """
+    width, ends = span[1] - span[0], [-span[0], span[1]]
+    for i, way in enumerate((-1, 1)):
+        end = (way * q).max()
+        there = way * q > end - AT_STOP * width
+        stays = (there & (way * u < -OPENS)).sum() > max(rate, STAYS * there.sum())
+        if np.ptp(q) > MOVES_STOP * width and end > ends[i] - MOVES_STOP * width and not stays:
+            ends[i] = end
+    return AT_STOP * width - ends[0], ends[1] - AT_STOP * width
 
 
 def after_start(one: Recording, j: int, of: int, rate: float) -> NDArray[np.bool_]:
@@ -423,8 +445,9 @@ def wrong_signs(reports: Mapping[str, JointReport]) -> Iterator[str]:
 
 
 def resting(reports: Mapping[str, JointReport]) -> set[str]:
-    """Recordings in which commands do not move a joint, whose motion nets must not learn."""
-    return {name for r in reports.values() if not r.other for name in r.still}
+    """Recordings in which commands do not move a joint, or are missing: no net must learn them."""
+    own = [r for r in reports.values() if not r.other]
+    return {name for r in own for name in (*r.still, *(() if r.follows else r.idle))}
 
 
 Check = tuple[Any, str, str, str]  # if it holds: the place, what was expected there, what it got
@@ -466,6 +489,7 @@ def lacks(name: str, r: JointReport) -> Iterator[Check]:
     got = f"{got} column?); figures and nets are of other recordings, if any"
     yield r.still and not r.other, name, "commands to move it", got
     got = f"none in {brief(list(r.idle))}: is the column of another joint, or was it not recorded?"
+    got = f"{got} Nets are of other recordings, if any"
     missing = r.idle and not (r.follows or r.other)
     yield missing, f"u_{name}", "commands where it moves", got
     yield r.rest, f"u_{name}", "0 at rest", f"{r.rest:.3g}"
@@ -578,5 +602,6 @@ def table(reports: Mapping[str, JointReport]) -> Iterator[str]:
         yield f"{name}: {told}, delay {r.delay:.2f} s"
         limits = f"q_min={r.low:.3f}, q_max={r.high:.3f}"
         speeds = "q_dot_up={:.3f}, q_dot_down={:.3f}".format(*r.fastest)
-        zones = ", ".join("?" if np.isnan(zone) else f"{zone:.3f}" for zone in r.dead_zone)
+        known = ~np.isnan(r.dead_zone) & (r.minutes > TOLD)
+        zones = ", ".join(f"{x:.3f}" if told else "?" for x, told in zip(r.dead_zone, known))
         yield f'Joint("{name}", {limits}, {speeds}, dead_zone=({zones}), ...)'

@@ -21,6 +21,7 @@ ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
 FIELDS = ("position", "velocity", "effort")  # of a JointState
 COMMAND_TIME = "time of commands"  # the column with their stamps
 LATE = 0.01  # s, assumed: differences between the delays of messages that are worth a word
+ONE_CLOCK = 0.5  # s, assumed: clocks of one robot differ by less
 OLD = 0.5  # s, and five usual periods, assumed: no machine waits so long for a command
 Values = list[tuple[float, dict[str, float]]]  # of joints by their names, each with its stamp [s]
 
@@ -48,8 +49,14 @@ def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], li
             require(one.msgtype in kinds, f"{path}: {one.topic}", " or ".join(kinds), one.msgtype)
         for one, stamp, data in bag.messages(chosen):
             found[one.topic].append((stamp / 1e9, bag.deserialize(data, one.msgtype)))
-        (times, q_warnings), (u_times, u_warnings) = (clock(*item) for item in found.items())
-        states, orders = [message for _, message in found[angles]], [m for _, m in found[commands]]
+        clocks = [clock(*item) for item in found.items()]
+        (stamps, offset, q_warnings), (u_stamps, u_offset, u_warnings) = clocks
+        if offset and u_offset and abs(offset - u_offset) < ONE_CLOCK:
+            offset = u_offset = min(offset, u_offset)  # the later ones come from farther away
+        rows, u_rows = np.argsort(stamps, kind="stable"), np.argsort(u_stamps, kind="stable")
+        times, u_times = stamps[rows] + offset, u_stamps[u_rows] + u_offset
+        states = [found[angles][row][1] for row in rows]
+        orders = [found[commands][row][1] for row in u_rows]
         names = [*dict.fromkeys(name for state in states for name in state.name)]
         q = [(t, joints_of(state, names, FIELDS[:1])) for t, state in zip(times, states)]
         used = [x for x in FIELDS if any(np.any(getattr(order, x, 0)) for order in orders)]
@@ -60,22 +67,26 @@ def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], li
     return table, [*q_warnings, *u_warnings, *order, *old_commands(commands, table)]
 
 
-def clock(topic: str, messages: list[tuple[float, Any]]) -> tuple[Array, list[str]]:
-    """The time of each message [s], and a warning if the recorder's would have been another."""
+def clock(topic: str, messages: list[tuple[float, Any]]) -> tuple[Array, float, list[str]]:
+    """The stamp of each message [s], what moves it to the recorder's clock [s], and warnings.
+
+    Stamps are the recorder's where a header has none, or where they make no sense.
+    """
     recorded = np.array([time for time, _ in messages])
     heads = [getattr(message, "header", None) for _, message in messages]
     stamps = np.array([h.stamp.sec + h.stamp.nanosec / 1e9 if h else 0.0 for h in heads])
-    steps = np.diff(stamps)
-    if not stamps.all() or (steps < 0).any() or not steps.any():  # nobody has set them
-        return recorded, []
-    late = recorded - stamps
     names = [" ".join(getattr(message, "name", ())) for _, message in messages]
     _, sender = np.unique(names, return_inverse=True)  # a node sends the same joints each time
+    late = recorded - stamps
     least = np.array([late[sender == i].min() for i in range(sender.max() + 1)])
     usual = np.quantile(late - least[sender], 0.9)
+    if not stamps.all() or usual > ONE_CLOCK or len({*stamps}) < len(stamps) / 2:
+        some = f"{topic}: expected a stamp in each header, got {(stamps == 0).sum()} without"
+        some += " (those of the recorder are taken)"
+        return recorded, 0.0, [some] if stamps.any() and not stamps.all() else []
     got = f"some that are {usual:.3f} s later than others (the headers' are taken)"
     told = f"{topic}: expected stamps of the recorder as regular as the headers', got {got}"
-    return stamps + least.min(), [told] if usual > LATE else []
+    return stamps, least.min(), [told] if usual > LATE else []
 
 
 def joints_of(message: Any, names: list[str], fields: Sequence[str]) -> dict[str, float]:

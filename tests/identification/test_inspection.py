@@ -13,6 +13,7 @@ from brokk_min.identification.inspection import (
     JointReport,
     inspect,
     repeated,
+    resting,
     table,
     warnings,
     wrong_signs,
@@ -239,6 +240,21 @@ def test_inspect__knows_that_after_a_gap_a_joint_is_in_motion():
     report = inspect(log_of(*pieces))["boom"]
     assert report.delay == inspect(log_of(*each))["boom"].delay == pytest.approx(0.1)
     assert report.still == report.opposite == [] and report.early == 0
+
+
+def test_inspect__knows_that_zeros_and_signs_differ_between_recordings():
+    """Then joints are at their stops at other angles, or in one recording at the other end."""
+    commands = [holds(seed, hold=40, ticks=2000, largest=0.8) for seed in range(6)]
+    pushed = [record("boom", u, stop=0.3)._replace(name=str(i)) for i, u in enumerate(commands)]
+    zeros = 0.02 * np.array([-1, 1, 0.5, -0.5, 0, 1])
+    moved = [one._replace(q=one.q + zero) for one, zero in zip(pushed, zeros, strict=True)]
+    assert inspect(log_of(*pushed))["boom"].still == []
+    assert inspect(log_of(*moved))["boom"].still == []
+    raised = [one._replace(q=one.q + 0.5) for one in pushed]
+    raised[2] = raised[2]._replace(q=-raised[2].q, q_dot=-raised[2].q_dot)
+    report = inspect(log_of(*raised))["boom"]
+    assert report.opposite == ["2"] and report.still == []
+    assert resting({"boom": GOOD._replace(still=["x"], idle=("y",))}) == {"x", "y"}
 
 
 def test_inspect__names_recordings_without_commands():

@@ -105,6 +105,30 @@ def test_read_ros__leaves_out_empty_messages_and_stamps_that_nobody_has_set(tmp_
         read_ros(tmp_path, "/joint_states", "/valves")
 
 
+def test_read_ros__does_not_take_a_distant_node_for_a_slow_valve(tmp_path):
+    """Messages of one clock come 3, 80 and 120 ms late, and two of them in the wrong order."""
+    messages = []
+    for k in range(60):
+        sent = 100 + k / 20
+        stamps = {"stamp": sent}
+        messages.append(
+            (sent + 0.003, "/valves", joint_state(["boom", "arm"], [0.5, 0.5], **stamps))
+        )
+        for name, late in (("boom", 0.080), ("arm", 0.190 if k == 30 else 0.120)):
+            q = joint_state([name], [0.01 * k], **stamps)
+            messages.append((sent + late, "/joint_states", q))
+    path = record(tmp_path / "bag", sorted(messages, key=lambda message: message[0]))
+    table, warnings = read_ros(path, "/joint_states", "/valves")
+    np.testing.assert_allclose(table["time"] - 100.003, np.arange(60) / 20, atol=1e-6)
+    np.testing.assert_allclose(table[COMMAND_TIME], table["time"], atol=1e-6)
+    np.testing.assert_allclose(table["q_arm"], 0.01 * np.arange(60), atol=1e-9)
+    assert warnings == []
+    messages[1] = (*messages[1][:2], joint_state(["boom"], [0.0], stamp=0.0))
+    path = record(tmp_path / "one", sorted(messages, key=lambda message: message[0]))
+    (told,) = read_ros(path, "/joint_states", "/valves")[1]
+    assert told.startswith("/joint_states: expected a stamp in each header, got 1 without")
+
+
 def test_read_ros__takes_the_field_with_commands_and_names_a_message_that_does_not_fit(tmp_path):
     def filled(k):
         return joint_state(["arm", "boom"], [0.0, 0.0], velocity=(-k / 40, k / 20))
