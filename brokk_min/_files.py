@@ -207,9 +207,9 @@ def save_arrays(path: Path, kind: str, header: Mapping[str, Any], **arrays: Any)
 
 
 def open_npz(path: Path) -> Any:
-    """An `.npz`, from which nothing is executed; ValueError: another kind of file."""
+    """An `.npz`, from which nothing is executed; ValueError: none, or a part of one."""
     zipped = zipfile.is_zipfile(path) or not Path(path).is_file()
-    require(zipped, str(path), "an .npz file (arrays in a zip archive)", "another kind of file")
+    require(zipped, str(path), "an .npz file (arrays in a zip archive)", "none, or a part of one")
     return np.load(path, allow_pickle=False)
 
 

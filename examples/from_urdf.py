@@ -144,7 +144,8 @@ def limits(chain: Chain, i: int) -> tuple[float, float, float]:
     low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
     speed = model.velocityLimit[joint.idx_v]
     low, high = (low, high) if joint.nq == 1 else (-np.inf, np.inf)  # 2: it turns without an end
-    usable, stand_in = -100 < low < high < 100, (0.0, 1.0) if slides else (-np.pi, np.pi)
+    usable = -100 < low < high < 100
+    stand_in = (0.0, 1.0) if slides else (-np.pi, np.pi)
     turns = not slides and np.isin(np.abs([low, high]).round(2), [3.14, 6.28]).any()
     if turns or not usable:
         others = "millimetres" if slides else "degrees"

@@ -140,10 +140,8 @@ class Fit(ReadsLogs):
                 twins = inspection.repeated(test.recordings, log.recordings)
                 require(not twins, "--test", "recordings that LOGS has not", brief(twins))
                 validation.scored_steps(test, machine.history)  # now, not after the search below
-            every, fitted = (
-                logs.join_logs({Path("LOGS"): log, Path("--test"): test}),
-                len(log.recordings),
-            )
+            every = logs.join_logs({Path("LOGS"): log, Path("--test"): test})
+            fitted = len(log.recordings)  # now each name is there once
             log = every._replace(recordings=every.recordings[:fitted])
             test = every._replace(recordings=every.recordings[fitted:])
         reports = inspection.inspect(every, known)

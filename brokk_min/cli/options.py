@@ -6,6 +6,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -149,7 +150,7 @@ def find_plant(name: str, machine: Machine) -> Plant:
     state = plant.reset(machine, q.copy())
     for _ in range(round(2 * machine.rate)):
         state = plant.step(machine, state, u)
-    moved = np.diag(np.asarray(state.q, float) - q)
+    moved = np.diag(np.asarray(state.q) - q)
     fits = np.all((moved > 0.005) & (moved < 1.5 * (high - low)))  # not in degrees
     wanted = "each joint to go up in 2 s of the largest command"
     require(bool(fits), name, wanted, f"{moved.round(3)} rad")
@@ -180,12 +181,17 @@ class OwnPlant:
 
     def step(self, machine: Machine, state: Any, u: Any) -> Any:
         """One tick under the held command `u` [-1, 1] (..., n)."""
-        return self.checked("step", np.shape(state.q), machine, state, np.array(u))
+        return self.checked("step", np.shape(state.q), machine, state, u)
 
-    def checked(self, method: str, shape: tuple[int, ...], *arguments: Any) -> Any:
-        """ValueError: whatever the file does, or a state without finite angles of this shape."""
+    def checked(self, method: str, shape: tuple[int, ...], machine: Machine, *given: Any) -> Any:
+        """What a method makes of copies of what is given, because it may write to them.
+
+        ValueError: whatever the file does, or a state without finite angles of this shape.
+        """
         with of_user(self.name, "a plant whose states have angles q"):
-            state = getattr(self.plant, method)(*arguments)
+            state = getattr(self.plant, method)(machine, *deepcopy(given))
+            kind = np.asarray(state.q).dtype
+            require(kind.kind in "fiu", "angles q of a state", "an array of numbers", kind)
             q = np.asarray(state.q, float)
             require(q.shape == shape, "angles q of a state", f"an array {shape}", q.shape)
             require(bool(np.isfinite(q).all()), "angles q of a state", "finite numbers", brief(q))

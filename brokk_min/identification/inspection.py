@@ -276,9 +276,8 @@ def fit_model(motion: Motion) -> Model:
         best = best_lag(motion, zones)
         for side in (0, 1):
             trials = [np.where(np.arange(2) == side, zone, zones) for zone in ZONES]
-            delay, tau = best.lag
-            each = ((trial, responses(motion, tau, trial)) for trial in trials)
-            models = (with_gains(motion, (delay, tau), trial, x) for trial, x in each)
+            lag = best.lag
+            models = (with_gains(motion, lag, of, responses(motion, lag[1], of)) for of in trials)
             best = max(models, key=lambda one: one.explained)
             zones = best.zones
     return best
@@ -388,9 +387,8 @@ def still_seconds(motion: Motion, model: Model, others: Motion) -> float:
     signed = expected_velocity(motion, model)
     expected = np.abs(signed)
     clear = max(CLEAR * np.abs(expected_velocity(others, model)).max(), MOVED)  # rad/s
-    if (expected > clear).sum() > AT_LEAST[1] * motion.rate and np.std(
-        motion.velocity
-    ) < RESTS * np.std(signed):
+    long = (expected > clear).sum() > AT_LEAST[1] * motion.rate
+    if long and np.std(motion.velocity) < RESTS * np.std(signed):
         return np.inf  # it may sag, but does not answer
     ends = reach(motion) < RESTS * clear  # of a second at rest
     rests = np.convolve(ends, np.ones(round(motion.rate)))[-len(ends) :] > 0
@@ -495,12 +493,8 @@ def lacks(name: str, r: JointReport) -> Iterator[Check]:
     yield r.rest, f"u_{name}", "0 at rest", f"{r.rest:.3g}"
     largest = max(r.largest)
     wanted = "commands in parts of full command, up to 1"
-    yield (
-        not missing and largest < SMALL,
-        f"u_{name}",
-        wanted,
-        f"at most {largest:.2g}: another unit?",
-    )
+    small = largest < SMALL and not missing
+    yield small, f"u_{name}", wanted, f"at most {largest:.2g}: another unit?"
     wanted = "commands of many sizes, because nets cannot guess what is between"
     yield r.one_size, f"u_{name}", wanted, "one in each direction"
     few = round(r.minutes, 1) < LEAST_MINUTES

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
@@ -175,6 +176,9 @@ def load(
 ) -> tuple[Checkpoint, Curve]:
     """The training of a checkpoint and its curve, in place of a fresh one of the same settings."""
     with expected(path, "a readable checkpoint"):
+        require(
+            zipfile.is_zipfile(path), str(path), "a readable checkpoint", "a part of one, or none"
+        )
         content = torch.load(path, weights_only=True)  # executes nothing
         expect_same(path, json.loads(content["about"]), about)
         fresh.agent.load_state_dict(content["agent"])

@@ -39,11 +39,17 @@ class Own(AnalyticPlant):
         return state._replace(q=self.scale * state.q[..., : self.joints])
 
 class Overwrites(Own):
+    def reset(self, machine, q):
+        state = super().reset(machine, q)
+        return state._make(array + 0 for array in state)._replace(q=q)
+
     def step(self, machine, state, u):
         u *= 0.5
-        return super().step(machine, state, 2 * u)
+        for array, new in zip(state, super().step(machine, state, 2 * u)):
+            array[...] = new
+        return state
 
-OVERWRITES = Overwrites()
+OVERWRITES, OBJECTS = Overwrites(), Own(scale=1 + 0j)
 OWN, REVERSED, BROKEN, DEGREES = Own(), Own(-1.0), Own(scale=float("nan")), Own(scale=57.3)
 FEWER, ENDS = Own(joints=4), Own(ends=60)
 
@@ -134,12 +140,16 @@ def test_find_plant__tries_each_joint(file):
     plant, u = find_plant(f"{file}:OVERWRITES", BROKK_170), np.full(5, 0.5)
     plant.step(BROKK_170, plant.reset(BROKK_170, q), u)
     assert (u == 0.5).all()  # what is recorded is what was commanded
+    state = plant.reset(BROKK_170, q)
+    after = plant.step(BROKK_170, plant.step(BROKK_170, state, u), u)
+    assert after.q is not state.q and (state.q == q).all() and (q == BROKK_170.q_start).all()
     for name, message in {
         "NUMBER": "expected a plant .* got 'int' object has no attribute 'reset'",
         "REVERSED": r"expected each joint to go up .* got \[-",
         "BROKEN": "angles q of a state: expected finite numbers, got .*nan",
         "FEWER": r"angles q of a state: expected an array \(5, 5\), got \(5, 4\)",
         "DEGREES": "expected each joint to go up",
+        "OBJECTS": "angles q of a state: expected an array of numbers, got complex128",
     }.items():
         with pytest.raises(ValueError, match=message):
             find_plant(f"{file}:{name}", BROKK_170)
