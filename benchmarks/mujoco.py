@@ -26,7 +26,7 @@ from brokk_min.evaluation import adaptive, baselines, metrics, sequences
 from brokk_min.evaluation.reproduce import QUICK, Budget, Chain, fit_net, train_one
 from brokk_min.evaluation.rollout import title
 from brokk_min.fit import Log, collect
-from brokk_min.identification import inspection, logs, validation
+from brokk_min.identification import advice, inspection, logs, validation
 from brokk_min.identification.net_file import load_net, select_nets
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, load_policy
@@ -156,7 +156,7 @@ def main(options: Options) -> None:
     chain = Chain(M, options.folder, budget, options.seed)
     chain.out.mkdir(parents=True, exist_ok=True)
     log, test = record(chain)
-    print("\n".join(inspection.table(inspection.inspect(log))))
+    print("\n".join(advice.table(inspection.inspect(log))))
     net = nets(chain, log)
     make(options, chain, net)
     runs = score(options, net, controllers(options, chain, net))

@@ -84,11 +84,11 @@ class Inspect(ReadsLogs):
     net: Path | None = None  # Also score these nets on the logs.
 
     def __call__(self, machine: Machine) -> None:
-        from brokk_min.identification import inspection, validation, valve_report
+        from brokk_min.identification import advice, inspection, validation, valve_report
 
         log, known = self.read_logs(self.logs, machine)
         reports = inspection.inspect(log, known)
-        warnings, scores = [*inspection.warnings(log, reports, known)], {}
+        warnings, scores = [*advice.warnings(log, reports, known)], {}
         if self.net:
             net, window = load_net(self.net), machine.velocity_samples
             wanted, got = f"velocity_samples {window} of --machine", net.velocity_samples
@@ -100,7 +100,7 @@ class Inspect(ReadsLogs):
                 print(*valve_report.describe(known, learned), sep="\n")
         drives = [read_frames(path) for path in self.logs if not is_table(path)]
         times = [line for frames in drives for line in timing(machine, frames)]
-        print(*times, f"{len(log.recordings)} recordings", *inspection.table(reports), sep="\n")
+        print(*times, f"{len(log.recordings)} recordings", *advice.table(reports), sep="\n")
         print_scores(scores, warnings)
 
 
@@ -124,7 +124,7 @@ class Fit(ReadsLogs):
 
     def __call__(self, machine: Machine) -> None:
         require_package("torch", "train")
-        from brokk_min.identification import fitting, inspection, validation
+        from brokk_min.identification import advice, fitting, inspection, validation
 
         settings = self.settings
         check_settings(settings)
@@ -145,15 +145,15 @@ class Fit(ReadsLogs):
             log = every._replace(recordings=every.recordings[:fitted])
             test = every._replace(recordings=every.recordings[fitted:])
         reports = inspection.inspect(every, known)
-        for wrong in (*inspection.mixed_up(reports), *inspection.wrong_signs(reports)):
+        for wrong in (*advice.mixed_up(reports), *advice.wrong_signs(reports)):
             raise ValueError(f"{self.logs[0] if len(self.logs) == 1 else 'LOGS'}: {wrong}")
-        resting = inspection.resting(reports)
+        resting = advice.resting(reports)
         with expected(self.logs[0], "a log to fit to"):
             log = logs.without(log, resting)
         with expected((self.test or self.logs)[0], "a log to score on"):
             log, test = (log, logs.without(test, resting)) if self.test else logs.split(log)
             unscored = [*validation.unscored(test, machine.history)]
-        warnings = [*inspection.warnings(every, reports, known), *unscored]
+        warnings = [*advice.warnings(every, reports, known), *unscored]
         print(*(f"warning: {one}\n" for one in warnings), sep="", end="", flush=True)
         name = known.name if known else ""
         net = fitting.fit_nets(log, settings, self.seed, machine, name)

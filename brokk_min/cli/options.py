@@ -23,6 +23,8 @@ from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX, Array, Controller, Machine, Measured, require
 
 LONGEST = 100  # m: no link is so long, but in millimetres most are
+LARGEST = {"alpha": 6.3, "theta": 6.3, "q_dot_up": 10, "q_dot_down": 10}  # in rad, or m; assumed
+MOST_TICKS = 1000  # of a history, assumed: a longer one would fill the memory
 FRACTIONS = ("gamma", "gae_lambda", "zero_goals", "axis_goals", "noise", "weight_decay")
 
 
@@ -74,7 +76,14 @@ class Command:
         longest = max(max(abs(j.a), abs(j.d)) for j in machine.joints)
         check(longest < LONGEST, "--machine", f"links in metres, below {LONGEST}", longest)
         check(len(machine.driven) > 0, "--machine", "a driven joint or more", "none")
+        speed, ticks = machine.tool_speed, machine.history
+        check(speed <= 10, "--machine", "tool_speed in m/s, up to 10", speed)
+        check(ticks <= MOST_TICKS, "--machine", f"a history of up to {MOST_TICKS} ticks", ticks)
         for j in machine.joints:
+            for field, most in LARGEST.items():
+                value = getattr(j, field)
+                wanted = f"{j.name}.{field} in rad (m), up to {most}"
+                check(abs(value) <= most, "--machine", wanted, f"{value:g}: degrees (mm)?")
             turns = j.kind == "revolute" and j.q_max - j.q_min > 4 * np.pi
             got = f"{j.q_min:g} to {j.q_max:g}: degrees?"
             check(not turns, "--machine", f"a range of {j.name} in rad, up to two turns", got)

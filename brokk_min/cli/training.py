@@ -83,6 +83,8 @@ class Train(Training):
         check(not empty, str(checkpoint), "no training with this name", got)
         begun = checkpoint.exists() and not self.resume
         check(not begun, str(checkpoint), "--resume or no checkpoint", "one")
+        lacks = self.resume and not checkpoint.exists()
+        check(not lacks, str(checkpoint), "one to --resume from", "none: ended, or not begun")
         self.writes(self.out, None if self.resume else Path(f"{self.out}.csv"))
         commands = sequences.axis_sequences(machine)
         starts = sequences.evaluation_starts(machine, STARTS, commands, 0)  # can it follow any?

@@ -92,6 +92,23 @@ def test_find_machine__takes_a_name_or_an_object_of_a_file(file):
         Command(machine=f"{file}:DIGGER").find_machine()
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ("tool_speed=400.0", "tool_speed in m/s, up to 10, got 400.0"),
+        ("history=10**9", "a history of up to 1000 ticks, got 1000000000"),
+        ("joints=(replace(TILT, alpha=90),)", "q2.alpha in rad .*, up to 6.3, got 90: degrees"),
+        ("joints=(replace(TILT, q_dot_up=24.0),)", r"q2.q_dot_up in rad \(m\), up to 10, got 24"),
+    ],
+)
+def test_find_machine__doubts_other_units(tmp_path, changes, message):
+    text = "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
+    text += "TILT = replace(BROKK_170.joints[1], driven=True)\n"
+    (tmp_path / "own.py").write_text(f"{text}OWN = replace(BROKK_170, q_start=(), {changes})\n")
+    with pytest.raises(WrongUse, match=f"--machine: expected {message}"):
+        Command(machine=f"{tmp_path / 'own.py'}:OWN").find_machine()
+
+
 def test_find_machine__stays_in_its_folder(file, monkeypatch):
     monkeypatch.chdir(file.parent)
     (file.parent / "deeper").mkdir()

@@ -70,6 +70,8 @@ def test_train__goes_on_only_if_it_is_told_to(tmp_path, capsys):
     (tmp_path / "r.npz.checkpoint").touch()
     assert run(f"train --out {tmp_path}/r.npz --resume") == 2
     assert "expected no training with this name, got an empty checkpoint" in capsys.readouterr().err
+    assert run(f"train --out {tmp_path}/s.npz --resume") == 2
+    assert "s.npz.checkpoint: expected one to --resume from, got none" in capsys.readouterr().err
     (tmp_path / "q.npz.csv").mkdir()
     assert run(f"train --out {tmp_path}/q.npz --force") == 2
     assert "q.npz.csv: expected a file in an existing" in capsys.readouterr().err

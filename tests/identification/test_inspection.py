@@ -9,15 +9,8 @@ import pytest
 from brokk_min.actuator import PLANT
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.fit import SINE, Log, Recording, collect, velocity_of
-from brokk_min.identification.inspection import (
-    JointReport,
-    inspect,
-    repeated,
-    resting,
-    table,
-    warnings,
-    wrong_signs,
-)
+from brokk_min.identification.advice import resting, table, warnings, wrong_signs
+from brokk_min.identification.inspection import JointReport, inspect, repeated
 from brokk_min.identification.validation import task_log
 from brokk_min.machine import BROKK_170
 from examples.mini_excavator import MINI_EXCAVATOR
