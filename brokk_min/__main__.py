@@ -3,7 +3,9 @@
 import io
 import os
 import shutil
+import signal
 import sys
+import threading
 from typing import Any
 
 # Before NumPy is imported: its BLAS threads, waiting for work, would take the cores from torch's.
@@ -43,6 +45,8 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="replace")  # an encoding that lacks a sign of ours
     if shutil.get_terminal_size().columns < NARROWEST:  # help of tyro would never end
         os.environ["COLUMNS"] = str(NARROWEST)
+    if threading.current_thread() is threading.main_thread():  # elsewhere Python refuses
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it tidies up
     name, *options = (sys.argv[1:] if arguments is None else arguments) or [""]
     try:
         if name in ("-h", "--help", "--version"):

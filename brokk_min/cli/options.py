@@ -44,7 +44,9 @@ def check_settings(settings: Any) -> None:
         option = f"--{name.replace('_', '-')}"
         if name in FRACTIONS:
             check(0 <= value <= 1, option, "0 to 1", value)
-        elif not (isinstance(value, bool) or name.startswith("log_std")):
+        elif name.startswith("log_std"):
+            check(value is None or bool(np.isfinite(value)), option, "a finite number", value)
+        elif not isinstance(value, bool):
             check(0 < value < np.inf, option, "a positive number", value)
 
 

@@ -19,6 +19,7 @@ from brokk_min.settings import PPOConfig, TaskConfig
 
 FIRST_STEPS = 400_000  # of our agent, of the five million of its recipe
 STARTS = 4  # for the table at the end
+LARGEST = 2**22  # steps between two updates, assumed: more would fill the memory
 
 
 @dataclass(kw_only=True)
@@ -46,7 +47,7 @@ class Training(Command):
         check(shipped.exists(), "--actuator", f"nets of {machine.name}", "none")
         return load_policy(shipped, machine).net
 
-    def recipe(self) -> Recipe:
+    def recipe(self, machine: Machine) -> Recipe:
         """The agent, its learner and its task."""
         require_package("torch", "train")
         learner, task = self.learner, self.task
@@ -55,6 +56,10 @@ class Training(Command):
         check(learner.gamma < 1, "--gamma", "below 1", learner.gamma)
         shortest, longest = task.hold_min_s, task.hold_max_s
         check(shortest <= longest, "--hold-max-s", f"{shortest} or more", longest)
+        steps = learner.num_envs * learner.horizon
+        check(steps <= LARGEST, "--num-envs, --horizon", f"a product up to {LARGEST:,}", steps)
+        tick = machine.dt
+        check(task.episode_s >= tick, "--episode-s", f"a tick, {tick:g} s, or more", task.episode_s)
         return replace(find_recipe(self.paper, self.critic), task=task, learner=learner)
 
 
@@ -74,7 +79,7 @@ class Train(Training):
         return made
 
     def __call__(self, machine: Machine) -> None:
-        recipe = self.recipe()
+        recipe = self.recipe(machine)
         from brokk_min.learning.checkpoint import train_policy
 
         checkpoint = Path(f"{self.out}.checkpoint")
@@ -123,7 +128,7 @@ class Sweep(Training):
     robustness: Path | None = None  # Also on changed machines, beside this folder's controllers.
 
     def __call__(self, machine: Machine) -> None:
-        recipe = self.recipe()
+        recipe = self.recipe(machine)
         from brokk_min.evaluation.metrics import COLUMNS, interval_text
         from brokk_min.evaluation.sweep import sweep
 

@@ -1,6 +1,7 @@
 """The command line as a user meets it: help, version, refusals in one line, exit statuses."""
 
 import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -10,7 +11,6 @@ import pytest
 from helpers_cli import run
 
 import brokk_min
-from benchmarks.one_process import raises
 from brokk_min.cli.training import FIRST_STEPS
 from brokk_min.learning.recipes import find_recipe
 
@@ -122,9 +122,10 @@ def test_version__is_that_of_the_project_and_of_its_citation(capsys):
     assert f"\nversion: {brokk_min.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
-def test_ctrl_c__ends_a_command_in_one_line(monkeypatch, capsys):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals__end_a_command_in_one_line(number, monkeypatch, capsys):
     collect = "brokk_min.cli.identification.Collect.__call__"
-    monkeypatch.setattr(collect, raises(KeyboardInterrupt))
+    monkeypatch.setattr(collect, lambda *_: signal.raise_signal(number))
     assert run("collect --out x.csv") == 1
     assert capsys.readouterr().err == "brokk-min: stopped\n"
 
@@ -151,6 +152,9 @@ VIRTUAL = "drive --interface virtual --channel v"
         (f"{TRAIN} --zero-goals 2.5", 2, "--zero-goals: expected 0 to 1, got 2.5"),
         (f"{TRAIN} --episode-s nan", 2, "--episode-s: expected a positive number, got nan"),
         (f"{TRAIN} --gamma 1.0", 2, "--gamma: expected below 1, got 1.0"),
+        (f"{TRAIN} --log-std nan", 2, "--log-std: expected a finite number, got nan"),
+        (f"{TRAIN} --horizon 99999999", 2, "--horizon: expected a product up to 4,194,304, got"),
+        (f"{TRAIN} --episode-s 0.01", 2, "--episode-s: expected a tick, 0.05 s, or more, got"),
         (f"{TRAIN} --hold-max-s 0.4", 2, "--hold-max-s: expected 0.5 or more, got 0.4"),
         ("sweep --actuator missing.npz --out s --seeds 0", 2, "--seeds: expected 1 or more, got 0"),
         ("evaluate --num-starts 0", 2, "--num-starts: expected 1 or more, got 0"),
