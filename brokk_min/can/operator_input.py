@@ -27,16 +27,21 @@ def read_commands(path: Path, machine: Machine) -> dict[str, Array]:
     names = ("time", "vx", "vy", "vz")
     table = read_csv(path, "sequence", *names)
     columns = np.stack([numbers(path, name, table[name]) for name in names], axis=1)
+    sequence = np.char.strip(table["sequence"])
     reach = 2 * sum(abs(joint.a) + abs(joint.d) for joint in machine.joints)  # m
     goals = {}
-    for name in dict.fromkeys(table["sequence"].tolist()):
-        rows = columns[table["sequence"] == name]
+    for name in dict.fromkeys(sequence.tolist()):
+        rows = columns[sequence == name]
         time, velocity = rows[:, 0] - rows[0, 0], rows[:, 1:]
         fits = len(time) > 1 and (np.diff(time) > 0.99 * machine.dt).all() and np.isfinite(rows)
         wanted = "two or more rows of finite numbers, each a tick or more after the one before"
         got = brief(time.tolist() if np.isfinite(rows).all() else rows.tolist())
         require(bool(np.all(fits)), f"{path}: sequence {name}", wanted, got)
         require(time[-1] <= DAY, f"{path}: sequence {name}", f"at most {DAY:g} s", time[-1])
+        fastest = float(np.linalg.norm(velocity[:-1], axis=-1).max())
+        slow = fastest <= machine.tool_speed * (1 + 1e-9)
+        wanted = f"at most tool_speed, {machine.tool_speed} m/s"
+        require(slow, f"{path}: sequence {name}", wanted, f"{fastest:.3g} m/s")
         path_of_tool = np.cumsum(velocity[:-1] * np.diff(time)[:, None], axis=0)
         farthest = float(np.abs(path_of_tool).max())
         wanted, got = f"a motion within {reach:.3g} m", f"{farthest:.3g} m: is time in s?"
@@ -44,10 +49,6 @@ def read_commands(path: Path, machine: Machine) -> dict[str, Array]:
         tick = np.arange(round(time[-1] * machine.rate))
         row = np.searchsorted(time, tick / machine.rate + 1e-6, "right") - 1
         goals[name] = velocity[row]
-        fastest = float(np.linalg.norm(goals[name], axis=-1).max())
-        slow = fastest <= machine.tool_speed * (1 + 1e-9)
-        wanted = f"at most tool_speed, {machine.tool_speed} m/s"
-        require(slow, f"{path}: sequence {name}", wanted, f"{fastest:.3g} m/s")
     return goals
 
 

@@ -122,6 +122,9 @@ class Reproduce(Command):
         budget = QUICK if self.quick else Budget()
         file = self.out / "results.json"
         check(self.force or not file.exists(), str(file), "no file (or --force)", "one")
+        log = self.out / "log.npz"  # a chain that was stopped has left another one beside it
+        free = self.force or not log.exists() or (self.out / "log_paper.npz").exists()
+        check(free, str(log), "no file (or --force)", "one that `reproduce` did not write")
         results = reproduce(machine, self.out, budget, self.seed)
         print(table(results["task_space"]["runs"]), *results["trainings"], sep="\n")
         print(self.out / "report.html", file, sep="\n")

@@ -24,6 +24,7 @@ from brokk_min.machine import BROKK_170, PWM_MAX, Array, Controller, Machine, Me
 
 LONGEST = 100  # m: no link is so long, but in millimetres most are
 LARGEST = {"alpha": 6.3, "theta": 6.3, "q_dot_up": 10, "q_dot_down": 10}  # in rad, or m; assumed
+MOST_U = 10  # of a controller, assumed: what goes beyond 1 is cut, but more are counts
 MOST_TICKS = 1000  # of a history, assumed: a longer one would fill the memory
 FRACTIONS = ("gamma", "gae_lambda", "zero_goals", "axis_goals", "noise", "weight_decay")
 
@@ -143,8 +144,8 @@ def load_object(option: str, name: str) -> Any:
 def find_plant(name: str, machine: Machine) -> Plant:
     """The analytic plant, nets of a file, or a plant of one's own.
 
-    Of this each joint has moved up for two seconds. ValueError: no plant or nets of the machine, or
-    a plant that reports degrees, stands still or obeys the wrong way.
+    Of this each joint has moved up and down for two seconds. ValueError: no plant or nets of the
+    machine, or a plant that reports degrees, begins elsewhere, stands still or obeys the wrong way.
     """
     if name.endswith(".npz"):
         return load_net(Path(name), machine)
@@ -156,15 +157,18 @@ def find_plant(name: str, machine: Machine) -> Plant:
         return PLANT
     plant = OwnPlant(name, load_object("--plant", name))
     low, high = machine.column("q_min"), machine.column("q_max")
-    q = np.tile((low + high) / 2, (machine.n, 1))
-    u = machine.pwm_limit / PWM_MAX * np.eye(machine.n)
+    ways = np.vstack([np.eye(machine.n), -np.eye(machine.n)])
+    q = np.tile((low + high) / 2, (len(ways), 1))
     state = plant.reset(machine, q.copy())
+    there = np.allclose(state.q, q, rtol=0, atol=0.01)
+    require(there, name, "a reset to the angles that are given", brief(np.asarray(state.q)[0]))
     for _ in range(round(2 * machine.rate)):
-        state = plant.step(machine, state, u)
-    moved = np.diag(np.asarray(state.q) - q)
+        state = plant.step(machine, state, machine.pwm_limit / PWM_MAX * ways)
+    moved = (ways * (state.q - q)).sum(axis=1).reshape(2, machine.n)  # up, down
     fits = np.all((moved > 0.005) & (moved < 1.5 * (high - low)))  # not in degrees
-    wanted = "each joint to go up in 2 s of the largest command"
-    require(bool(fits), name, wanted, f"{moved.round(3)} rad")
+    wanted = "each joint to go up and down in 2 s of the largest commands"
+    up, down = moved.round(3)
+    require(bool(fits), name, wanted, f"{up} rad up and {down} rad down")
     return plant
 
 
@@ -235,9 +239,14 @@ class OwnController:
         """ValueError: whatever the file does, or what are no finite commands (num, n)."""
         with of_user(self.name, "a controller that returns commands and its state"):
             u, state = self.inner(measured, state)
-            shape = (len(measured.q), self.machine.n)
+            shape, kind = (len(measured.q), self.machine.n), np.asarray(u).dtype.kind
             require(np.shape(u) == shape, "commands", f"an array {shape}", np.shape(u))
-            require(bool(np.isfinite(u).all()), "commands", "finite numbers", brief(u))
+            numbers = kind in "fiu" and bool(np.isfinite(u).all())
+            require(numbers, "commands", "finite numbers", brief(u))
+            counts = np.abs(u).max() > MOST_U
+            require(not counts, "commands", "parts of full command, -1 to 1", brief(u))
+            others = np.any(u[:, self.machine.locked])
+            require(not others, "commands", "0 for joints that are not driven", brief(u))
         return u, state
 
 

@@ -98,8 +98,8 @@ def train_policy(
         if now.update % EVERY == 0 or now.global_step >= config.total_steps:
             alone = written(checkpoint) in (0, ours)
             require(alone, str(checkpoint), "one training with this name", "another, which goes on")
-            write_csv(Path(f"{out}.csv"), rows[0], [row.values() for row in rows])
             save(checkpoint, about, env, now, rows)
+            write_csv(Path(f"{out}.csv"), rows[0], [row.values() for row in rows])
             ours = written(checkpoint)
 
     size: dict[str, Any] = {"total": config.total_steps, "initial": start.global_step}

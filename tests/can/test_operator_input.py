@@ -33,6 +33,7 @@ def test_read_commands__holds_values_until_the_next_row(tmp_path):
         ("a,1,0,0,0\na,1.01,0,0,0\n", "a tick or more .*, got .0.0, 0.01"),
         ("a,1,0,0,inf\na,2,0,0,0\n", "two or more rows of finite"),
         ("a,1,0.3,0.4,0\na,2,0,0,0\n", "a: expected at most tool_speed, 0.3 m/s, got 0.5 m/s"),
+        ("a,1,100,0,0\na,2,0,0,0\n", "a: expected at most tool_speed, 0.3 m/s, got 100 m/s"),
         ("a,1,0.1,0,0\na,9001,0,0,0\n", "a motion within 11.9 m, got 900 m: is time in s?"),
         ("a,1,0,0,0\na,1e12,0,0,0\n", "at most 86400 s"),
         ("", "expected rows, got none"),

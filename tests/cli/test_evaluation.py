@@ -61,7 +61,11 @@ class Ends(Nan):
 class Moves(Nan):
     def __call__(self, measured, state):
         import os; os.chdir("/")
-        return np.ones((len(measured.q), 5)), None
+        return 0.5 * np.ones((len(measured.q), 5)) * [1, 0, 1, 1, 1], None
+class Locked(Nan):
+    def __call__(self, measured, state): return np.ones((len(measured.q), 5)), None
+class Counts(Nan):
+    def __call__(self, measured, state): return np.full((len(measured.q), 5), 80), None
 class Alone(Nan):
     def __call__(self, measured, state): return np.ones((len(measured.q), 5))
 """
@@ -78,7 +82,8 @@ def test_evaluate__takes_a_controller_of_ones_own(folder, capsys):
     assert f"{name:56}{'-':>15}" in capsys.readouterr().out
     (folder / "bad.py").write_text(BAD)
     told = "finite numbers, got", "an array (1, 5), got (1, 2)", "commands and its state, got"
-    for kind, words in zip(("Nan", "Short", "Alone"), told, strict=True):
+    told = *told, "0 for joints that are not driven, got", "parts of full command, -1 to 1, got"
+    for kind, words in zip(("Nan", "Short", "Alone", "Locked", "Counts"), told, strict=True):
         assert evaluate(folder, f"--controller {folder}/bad.py:{kind}") == 1
         assert words in capsys.readouterr().err
     assert evaluate(folder, f"--controller {folder}/bad.py:Ends") == 1

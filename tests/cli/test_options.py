@@ -49,6 +49,15 @@ class Overwrites(Own):
             array[...] = new
         return state
 
+class OnlyUp(Own):
+    def step(self, machine, state, u):
+        return super().step(machine, state, abs(u))
+
+class Elsewhere(Own):
+    def reset(self, machine, q):
+        return super().reset(machine, q + 0.1)
+
+ONLY_UP, ELSEWHERE = OnlyUp(), Elsewhere()
 OVERWRITES, OBJECTS = Overwrites(), Own(scale=1 + 0j)
 OWN, REVERSED, BROKEN, DEGREES = Own(), Own(-1.0), Own(scale=float("nan")), Own(scale=57.3)
 FEWER, ENDS = Own(joints=4), Own(ends=60)
@@ -164,7 +173,9 @@ def test_find_plant__tries_each_joint(file):
         "NUMBER": "expected a plant .* got 'int' object has no attribute 'reset'",
         "REVERSED": r"expected each joint to go up .* got \[-",
         "BROKEN": "angles q of a state: expected finite numbers, got .*nan",
-        "FEWER": r"angles q of a state: expected an array \(5, 5\), got \(5, 4\)",
+        "FEWER": r"angles q of a state: expected an array \(10, 5\), got \(10, 4\)",
+        "ONLY_UP": r"expected each joint to go up and down .* rad up and \[-",
+        "ELSEWHERE": "expected a reset to the angles that are given, got array",
         "DEGREES": "expected each joint to go up",
         "OBJECTS": "angles q of a state: expected an array of numbers, got complex128",
     }.items():
