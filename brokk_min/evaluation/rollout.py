@@ -27,9 +27,10 @@ TITLES = {  # of controllers in tables, figures and windows, by their names in f
 
 def title(name: str) -> str:
     """How tables name a controller; "+cold" and "+warm" are of `evaluation.adaptive`."""
-    plain, _, start = name.partition("+")
-    learns = {"": "", "cold": ", adaptive", "warm": ", adaptive, warm"}
-    return TITLES.get(plain, plain) + learns[start]
+    for start, learns in (("+cold", ", adaptive"), ("+warm", ", adaptive, warm")):
+        if name.endswith(start):
+            return title(name.removesuffix(start)) + learns
+    return TITLES.get(name, name)
 
 
 def valves_at_rest(name: str) -> str:

@@ -1,12 +1,13 @@
 """What is wrong with a log, and what it lacks, in words: by the reports of `inspection`."""
 
 from collections.abc import Iterator, Mapping
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from brokk_min._files import brief
-from brokk_min.fit import Log
+from brokk_min.fit import MOVED, Log
 from brokk_min.identification.inspection import COARSE, LEAST_EXPLAINED, JointReport, repeated
 from brokk_min.identification.joint_model import LATEST, OPENS
 from brokk_min.machine import PWM_MAX, Joint, Machine
@@ -21,6 +22,7 @@ ZONE = 0.04  # of full command, between the dead zones of machine and log
 WORSE = 1.25  # times as much is not explained with the machine's dead zones
 SMALL = 0.05  # of full command: no machine is driven by less
 FASTER, SLOWER = 1.2, 0.4  # of the machine's fastest motion, which are in the log
+FAST, PART = 0.5, 0.3  # of it, by so small a part of the largest command
 AT_LIMIT = 0.95  # of the command limit: such commands should give the fastest motion
 
 
@@ -68,6 +70,7 @@ def causes(name: str, r: JointReport) -> Iterator[Check]:
     got = f"motion at so many times the speed of others {r.follows}: {doubt}"
     yield r.follows, f"q_{name}", "rest without commands", got
     yield another(name, r)
+    yield r.rest, f"u_{name}", "0 at rest", f"{r.rest:.3g}"
     yield one_sided(r), f"u_{name}", "commands of both signs", "one: is the sign in another column?"
     yield r.early, name, "motion after its commands", f"it {r.early:.2f} s before: another clock?"
     got = f"steps of {r.step:.3g} rad (of the encoder, or noise): {r.explained:.0%} of single"
@@ -82,14 +85,14 @@ def causes(name: str, r: JointReport) -> Iterator[Check]:
 
 def lacks(name: str, r: JointReport) -> Iterator[Check]:
     """What nets could not learn from a log."""
-    got = f"rest or other motion in {brief(r.still)} (engine or pump off, blocked, another clock or"
-    got = f"{got} column?); figures and nets are of other recordings, if any"
+    why = "engine or pump off, blocked, no oil left, an angle that was not read, another clock or"
+    got = f"rest or other motion in {brief(r.still)} ({why} column?); figures and nets are of other"
+    got = f"{got} recordings, if any"
     yield r.still and not r.other, name, "commands to move it", got
     got = f"none in {brief(list(r.idle))}: is the column of another joint, or was it not recorded?"
     got = f"{got} Nets are of other recordings, if any"
     missing = r.idle and not (r.follows or r.other)
     yield missing, f"u_{name}", "commands where it moves", got
-    yield r.rest, f"u_{name}", "0 at rest", f"{r.rest:.3g}"
     largest = max(r.largest)
     wanted = "commands in parts of full command, up to 1"
     small = largest < SMALL and not missing
@@ -115,16 +118,21 @@ def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
     yield narrow, name, f"{LEAST_RANGE:.0%} of its range or more", got
     if r.explained <= LEAST_EXPLAINED:
         return
+    limit = machine.pwm_limit / PWM_MAX
+    speeds, largest = (joint.q_dot_up, joint.q_dot_down), max(r.largest)
+    ratio = np.array(r.fastest) / speeds
+    scaled = bool((ratio > FAST).any()) and SMALL <= largest < PART * limit
+    wanted, got = f"commands up to {limit:.2f} at its fastest motion", f"at most {largest:.2g}"
+    yield scaled, f"u_{name}", wanted, f"{got}: another unit?"
+    slow = bool(((ratio < SLOWER) & (np.array(r.largest) > AT_LIMIT * limit)).any())
+    wanted = f"the machine's q_dot_up and q_dot_down {speeds} as the fastest motion"
+    got = "({:.3g}, {:.3g}) rad/s".format(*r.fastest)
+    yield slow or (ratio > FASTER).any(), name, wanted, got
     apart = (np.abs(np.subtract(r.dead_zone, joint.dead_zone)) > ZONE).any()  # not nan
     worse = 1 - r.by_zones > WORSE * (1 - r.explained)
     got = "({:.2f}, {:.2f})".format(*r.dead_zone)
-    yield apart and worse, name, f"the machine's dead_zone {joint.dead_zone}", got
-    speeds = joint.q_dot_up, joint.q_dot_down
-    ratio = np.array(r.fastest) / speeds
-    slow = (ratio < SLOWER) & (np.array(r.largest) > AT_LIMIT * machine.pwm_limit / PWM_MAX)
-    wanted = f"the machine's q_dot_up and q_dot_down {speeds} as the fastest motion"
-    got = "({:.3g}, {:.3g}) rad/s".format(*r.fastest)
-    yield (slow | (ratio > FASTER)).any(), name, wanted, got
+    alone = not (scaled or slow or r.rest)  # else it is one of what other commands do
+    yield apart and worse and alone, name, f"the machine's dead_zone {joint.dead_zone}", got
     memory = machine.history * machine.dt
     wanted = f"more than delay and lag of {name}, {r.delay:.2f} and {r.tau:.2f} s"
     yield r.delay + r.tau > memory, "history", wanted, f"{memory:.2f} s"
@@ -141,6 +149,16 @@ def beyond(low: float, high: float, joint: Joint) -> float:
     return max(joint.q_min - low, high - joint.q_max)
 
 
+def copied(log: Log) -> list[tuple[str, str]]:
+    """Pairs of joints that move and have the same angles in all recordings."""
+    return [
+        (log.joints[i], log.joints[j])
+        for i, j in combinations(range(len(log.joints)), 2)
+        if all(np.array_equal(one.q[:, i], one.q[:, j]) for one in log.recordings)
+        and any(np.ptp(one.q[:, i]) > MOVED for one in log.recordings)
+    ]
+
+
 def warnings(
     log: Log, reports: Mapping[str, JointReport], machine: Machine | None
 ) -> Iterator[str]:
@@ -149,11 +167,14 @@ def warnings(
     if twins := repeated(log.recordings, ()):
         yield f"recordings: expected each once, got again {brief(twins)}"
     yield from wrong_signs(reports)
+    copies = {name for pair in copied(log) for name in pair}
+    for one, other in copied(log):
+        yield f"q_{other}: expected a column of its own, got that of q_{one}"
     for name in log.joints:
         if name not in reports:
             yield f"{name}: expected commands in the log, got none"
     for name, r in reports.items():
-        first = [check for check in causes(name, r) if check[0]][:1]
+        first = [check for check in causes(name, r) if check[0] and name not in copies][:1]
         known = differences(name, r, machine) if machine and not r.follows else ()
         for holds, place, wanted, got in (*first, *lacks(name, r), *known):
             if holds:

@@ -73,8 +73,8 @@ class Alone(Nan):
 
 def test_evaluate__takes_a_controller_of_ones_own(folder, capsys):
     example = Path(__file__).parents[2] / "examples" / "own_controller.py"
-    (folder / "own.py").write_text(example.read_text())
-    name = f"{folder}/own.py:Proportional"
+    (folder / "c+t.py").write_text(example.read_text())
+    name = f"{folder}/c+t.py:Proportional"
     assert evaluate(folder, f"--controller {name} --json {folder}/own.json") == 0
     runs = json.loads((folder / "own.json").read_text())["runs"]
     own = next(run for run in runs if run["controller"] == name)
@@ -142,6 +142,10 @@ def test_reproduce__does_not_write_over_results(tmp_path, capsys):
     assert run(f"reproduce --quick --out {tmp_path}") == 2
     assert "results.json: expected no file (or --force), got one" in capsys.readouterr().err
     assert (tmp_path / "results.json").read_text() == "{}"
+    (tmp_path / "results.json").rename(tmp_path / "log.npz")
+    assert run(f"reproduce --quick --out {tmp_path}") == 2
+    assert "log.npz: expected no file (or --force), got one that" in capsys.readouterr().err
+    assert (tmp_path / "log.npz").read_text() == "{}"
 
 
 def test_evaluate__adapts_each_controller_cold_and_warm(folder, capsys, monkeypatch):

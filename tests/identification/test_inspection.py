@@ -167,6 +167,19 @@ GOOD = JointReport(
         ({"still": ["x"]}, ["q1: expected commands to move it, got .* .'x'."]),
         ({"rest": 0.1}, ["u_q1: expected 0 at rest, got 0.1"]),
         (
+            {"rest": 0.5, "largest": (0.9, 0.0), "explained": 0.5, "dead_zone": (0.56, np.nan)},
+            ["u_q1: expected 0 at rest, got 0.5"],
+        ),
+        (
+            {"largest": (0.063, 0.063), "dead_zone": (0.01, 0.01), "by_zones": 0.2},
+            ["u_q1: expected commands up to 0.63 at its fastest motion, got at most 0.063"],
+        ),
+        (
+            {"fastest": (0.05, 0.05), "largest": (0.63, 0.63), "dead_zone": (0.0, 0.0)}
+            | {"by_zones": 0.2},
+            ["q1: expected the machine's .* fastest motion, got .0.05, 0.05."],
+        ),
+        (
             {"one_size": True},
             ["u_q1: expected commands of many sizes, because .*, got one in each"],
         ),
@@ -192,6 +205,14 @@ def test_warnings__know_what_a_log_lacks_and_where_it_contradicts_its_machine(ch
     first, *found = warnings(log, {"q1": GOOD._replace(**changes)}, BROKK_170)
     assert first == "left out" and len(found) == len(expected)
     assert all(re.match(start, text) for text, start in zip(found, expected, strict=True))
+
+
+def test_warnings__name_the_same_angle_in_two_columns():
+    recordings = [record(name, holds()) for name in TRUE]
+    twins = [one._replace(q=one.q[:, [0, 0]], q_dot=one.q_dot[:, [0, 0]]) for one in recordings]
+    told = [*warnings(log_of(*twins), inspect(log_of(*twins)), None)]
+    assert "q_arm: expected a column of its own, got that of q_boom" in told
+    assert not any("60%" in text or "ground" in text for text in told)
 
 
 def boom(*commands, change=lambda one: one):
