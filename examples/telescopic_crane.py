@@ -52,7 +52,8 @@ TELESCOPIC_CRANE = Machine(
     ground=0.0,
     valve_frame_id=0x220, controller_node=0x40,
     hydraulics=Hydraulics(  # of the analytic plant
-        {"slew": Cylinder(rod=0.20), "lift": Cylinder(1.0, 0.4, 0.6, 0.008)}, pump_flow=0.0020
+        {"slew": Cylinder(rod=0.20), "lift": Cylinder(1.0, 0.4, 0.6, 0.008, (0.047, 0.069))},
+        pump_flow=0.0020,
     ),
 )
 # fmt: on

@@ -15,7 +15,7 @@ from brokk_min.can import canopen
 from brokk_min.can.canopen import Frame, Nodes
 from brokk_min.can.connection import plain_frame
 from brokk_min.fit import Log, machine_log
-from brokk_min.identification.readings import FASTER, NOISE
+from brokk_min.identification.readings import FASTER, NOISE, rows_per_value
 from brokk_min.machine import Array, Machine, require
 
 # (time) bus identifier#data direction, of a data frame with 11 bits; T: the program sent it. On a
@@ -32,6 +32,7 @@ OTHER = re.compile(
 )
 NOTES = ("operator", "timing", "valves", "shadow")  # no buses: what `drive` notes beside the frames
 LOST = 1.0  # s, assumed: a shorter gap in a drive is no pause of the operator
+OTHER_RATE = 0.03  # of the rate: no clock is so far off
 FALLS = 0.01  # of the rows: time falls once if a clock was set, in differences each tick
 OTHERS = (".asc", ".blf", ".trc", ".gz")  # that python-can reads
 
@@ -160,6 +161,12 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     gap = np.abs(late - 1) >= 0.5
     jump = (np.abs(np.diff(q, axis=0)) > reach).any(axis=1)
     pieces = np.split(np.arange(len(ticks)), np.flatnonzero(gap | jump) + 1)
+    usual = machine.rate / float(np.median(late)) if len(late) else machine.rate
+    fits = abs(usual / machine.rate - 1) < OTHER_RATE
+    require(fits, "log", f"{machine.rate:g} Hz (--machine)", f"SYNC at {usual:.3g} Hz")
+    rows = [rows_per_value(angle) for angle in q.T]
+    slow = [f"q_{name} {n:g}" for name, n in zip(machine.names, rows, strict=True) if n > 1]
+    require(not slow, "log", "a new angle in each tick", f"one in so many of {', '.join(slow)}")
     longest, least = max(map(len, pieces)), machine.history + 2
     wanted = f"{least} ticks of driving in a row at {machine.rate:g} Hz (--machine)"
     got = f"{longest} at most ({syncs} SYNCs; after {len(whole)} of them one position of each joint"
@@ -168,6 +175,12 @@ def log_for_fit(machine: Machine, frames: Iterable[Frame]) -> Log:
     long = [rows for rows in pieces if len(rows) >= least]
     log = machine_log(machine, [(f"drive_{k:03d}", u[i], q[i]) for k, i in enumerate(long)])
     lost = time[:-1][gap & (late < LOST * machine.rate)]
-    got = f"{len(lost)} gaps, the first after {min(lost, default=0):.2f} s: are frames lost?"
-    told = (f"log: expected positions and a valve frame in each tick of a drive, got {got}",)
-    return log._replace(warnings=told if len(lost) else ())
+    told = []
+    if len(lost):
+        got = f"{len(lost)} gaps, the first after {min(lost):.2f} s: are frames lost?"
+        told += [f"log: expected positions and a valve frame in each tick of a drive, got {got}"]
+    leaps = time[1:][jump & ~gap]
+    if len(leaps):
+        got = f"{len(leaps)} jumps, the first at {leaps[0]:.2f} s"
+        told += [f"log: expected angles that no joint is too slow for, got {got}"]
+    return log._replace(warnings=tuple(told))

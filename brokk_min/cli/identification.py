@@ -147,14 +147,14 @@ class Fit(ReadsLogs):
         reports = inspection.inspect(every, known)
         for wrong in (*advice.mixed_up(reports), *advice.wrong_signs(reports)):
             raise ValueError(f"{self.logs[0] if len(self.logs) == 1 else 'LOGS'}: {wrong}")
-        resting = advice.resting(reports)
+        warnings, resting = [*advice.warnings(every, reports, known)], advice.resting(reports)
+        print(*(f"warning: {one}\n" for one in warnings), sep="", end="", flush=True)
         with expected(self.logs[0], "a log to fit to"):
             log = logs.without(log, resting)
         with expected((self.test or self.logs)[0], "a log to score on"):
             log, test = (log, logs.without(test, resting)) if self.test else logs.split(log)
             unscored = [*validation.unscored(test, machine.history)]
-        warnings = [*advice.warnings(every, reports, known), *unscored]
-        print(*(f"warning: {one}\n" for one in warnings), sep="", end="", flush=True)
+        print(*(f"warning: {one}\n" for one in unscored), sep="", end="", flush=True)
         name = known.name if known else ""
         net = fitting.fit_nets(log, settings, self.seed, machine, name)
         scores = validation.score(net, test)
@@ -163,7 +163,7 @@ class Fit(ReadsLogs):
         if self.json:
             files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
             meta = {"machine": name, **files, **net.training}
-            told = {"joints": scores, "warnings": of_scores + warnings}
+            told = {"joints": scores, "warnings": of_scores + warnings + unscored}
             write_json(self.json, {"meta": meta} | told)
         print(f"{self.out}: nets of {name or 'an unknown machine: one a joint, without a valve'}")
         print_scores(scores, of_scores)

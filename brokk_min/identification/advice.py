@@ -20,6 +20,7 @@ BEYOND = 0.05  # of a joint's range, outside of it
 COARSER = 0.15  # more of the coarse motion is explained: angles have noise or steps
 ZONE = 0.04  # of full command, between the dead zones of machine and log
 WORSE = 1.25  # times as much is not explained with the machine's dead zones
+ONE_SIDED = 0.8  # of a joint's motion; of sound logs 0.84 is explained
 SMALL = 0.05  # of full command: no machine is driven by less
 FASTER, SLOWER = 1.2, 0.4  # of the machine's fastest motion, which are in the log
 FAST, PART = 0.5, 0.3  # of it, by so small a part of the largest command
@@ -85,15 +86,18 @@ def causes(name: str, r: JointReport) -> Iterator[Check]:
 
 def lacks(name: str, r: JointReport) -> Iterator[Check]:
     """What nets could not learn from a log."""
-    why = "engine or pump off, blocked, no oil left, an angle that was not read, another clock or"
-    got = f"rest or other motion in {brief(r.still)} ({why} column?); figures and nets are of other"
-    got = f"{got} recordings, if any"
+    why = (
+        "engine or pump off, blocked, no oil left, an angle that was not read, another zero, clock"
+    )
+    got = f"rest or other motion in {brief(r.still)} ({why} or column?); figures and nets are of"
+    got = f"{got} other recordings, if any"
     yield r.still and not r.other, name, "commands to move it", got
     got = f"none in {brief(list(r.idle))}: is the column of another joint, or was it not recorded?"
     got = f"{got} Nets are of other recordings, if any"
-    missing = r.idle and not (r.follows or r.other)
-    yield missing, f"u_{name}", "commands where it moves", got
     largest = max(r.largest)
+    tiny = 0 < largest < SMALL  # of another unit, so small that they look like none
+    missing = r.idle and not (r.follows or r.other or one_sided(r) or tiny)
+    yield missing, f"u_{name}", "commands where it moves", got
     wanted = "commands in parts of full command, up to 1"
     small = largest < SMALL and not missing
     yield small, f"u_{name}", wanted, f"at most {largest:.2g}: another unit?"
@@ -110,11 +114,15 @@ def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
     low, high = np.deg2rad([r.low, r.high])
     turned = min(beyond(low, high, joint), beyond(-high, -low, joint)) < BEYOND * width
     turned &= r.high - r.low > 2 * width or max(-r.low, r.high) > 2 * np.pi  # else it would fit
+    off = min(beyond(r.low + turn, r.high + turn, joint) for turn in (-2 * np.pi, 2 * np.pi))
+    turned &= off > BEYOND * width  # it would fit a turn on
     doubt = f"in degrees (--map {name}=COLUMN:deg, or -deg)" if turned else "another zero or joint"
     mirrored = r.sign < 0 and beyond(-r.high, -r.low, joint) <= BEYOND * width
     outside = not mirrored and beyond(r.low, r.high, joint) > BEYOND * width
     yield outside, f"q_{name}", f"{joint.q_min:g} to {joint.q_max:g}", f"{got}: {doubt}?"
     narrow = r.high - r.low < LEAST_RANGE * width
+    already = narrow and LEAST_RANGE < np.rad2deg(r.high - r.low) / width < 1 + BEYOND
+    got += ": already in radians (--map without :deg)?" if already else ""
     yield narrow, name, f"{LEAST_RANGE:.0%} of its range or more", got
     if r.explained <= LEAST_EXPLAINED:
         return
@@ -141,7 +149,7 @@ def differences(name: str, r: JointReport, machine: Machine) -> Iterator[Check]:
 def one_sided(r: JointReport) -> bool:
     """Does a joint move both ways, and not by its commands, which are all of one sign?"""
     both = min(r.fastest) > OPENS * max(r.fastest)
-    return both and min(r.largest) <= 0 and r.explained < LEAST_EXPLAINED
+    return both and min(r.largest) <= 0 < max(r.largest) and r.explained < ONE_SIDED
 
 
 def beyond(low: float, high: float, joint: Joint) -> float:
@@ -174,6 +182,9 @@ def warnings(
         if name not in reports:
             yield f"{name}: expected commands in the log, got none"
     for name, r in reports.items():
+        if r.high - r.low <= MOVED:
+            yield f"q_{name}: expected motion, got {r.low:.3g} to {r.high:.3g}"
+            continue
         first = [check for check in causes(name, r) if check[0] and name not in copies][:1]
         known = differences(name, r, machine) if machine and not r.follows else ()
         for holds, place, wanted, got in (*first, *lacks(name, r), *known):

@@ -114,7 +114,9 @@ def test_log_for_fit__by_hand():
     first, unread = [k for k, frame in enumerate(frames) if frame.id == 0x181], frames.copy()
     for k in (first[0], first[18]):
         unread[k] = frames[k]._replace(data=struct.pack("<I", 3000))
-    (long,) = log_for_fit(machine, unread).recordings  # 16 after the second one, 14 before it
+    leaps = log_for_fit(machine, unread)
+    (long,) = leaps.recordings  # 16 after the second one, 14 before it
+    assert "too slow for, got 3 jumps, the first at 100.10 s" in leaps.warnings[1]
     np.testing.assert_allclose(long.q[:, 0], (np.arange(120, 136)) * STEP)
     assert "got 2 gaps, the first after 101.40 s: are frames lost?" in log.warnings[0]
     refusal = (
@@ -123,6 +125,17 @@ def test_log_for_fit__by_hand():
     refusal += "11 of them one position of each joint, in 11 of these an enabled valve frame"
     with pytest.raises(ValueError, match=refusal):
         log_for_fit(machine, frames[:100])
+    slower = [frame._replace(time=1.25 * frame.time) for frame in frames]
+    with pytest.raises(ValueError, match=r"log: expected 10 Hz \(--machine\), got SYNC at 8 Hz"):
+        log_for_fit(machine, slower)
+    held = [  # every second answer of q3 is the one before it
+        frame._replace(data=struct.pack("<I", round(300 + 150 * np.sin((5 * frame.time) // 1 / 4))))
+        if frame.id == 0x183
+        else frame
+        for frame in frames
+    ]
+    with pytest.raises(ValueError, match="a new angle in each tick, got one in so many of q_q3 2"):
+        log_for_fit(machine, held)
     other = replace(machine, valve_frame_id=0x211)
     with pytest.raises(ValueError, match=r"frames, 080 181 .* 185 211 .*, got none with 211$"):
         log_for_fit(other, frames)
