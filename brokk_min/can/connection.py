@@ -27,6 +27,7 @@ class Bus:
     file: int = -1  # descriptor to wait on; -1: `bus` waits itself
     clock: Callable[[], float] = time.monotonic  # s
     sleep: Callable[[float], object] = time.sleep
+    heard: bool = False  # has anybody else sent a frame?
     allowed: Container[int] = range(0x800)  # identifiers of frames that it sends
 
     def __post_init__(self) -> None:
@@ -55,6 +56,7 @@ class Bus:
             self.echoes.remove((frame.id, frame.data))
             return frame._replace(id=-1)
         self._log(message, self.name)
+        self.heard = True
         return frame
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -127,8 +129,12 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
     try:
         with closing(bus):
             yield bus
-    except can.CanError as error:
-        raise ValueError(f"{where} that works, got {brief(error)}") from error
+    except BaseException as error:
+        if isinstance(error, can.CanError):
+            raise ValueError(f"{where} that works, got {brief(error)}") from error
+        if log and not bus.heard:  # a log of our own frames alone would only be in the way
+            log.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """The commands at a machine, simulated or real, and for what was recorded there."""
 
 import logging
+import os
 import struct
 import warnings
 from dataclasses import dataclass
@@ -74,6 +75,8 @@ class DriveMachine(Command):
         new = None if self.valves and self.valves.exists() else self.valves
         used = default_policy(machine, self.policy) if self.controller != "jog" else ()
         self.writes(self.log, new, reads=[Path(self.command), *used])
+        kept = self.valves is None or os.access(self.valves.resolve().parent, os.W_OK)
+        check(kept, str(self.valves), "a file in a writable folder", "another")
         learns = self.adapt or self.shadow
         check(learns or not self.valves, "--valves", "--adapt or --shadow with it", self.valves)
         nets = self.controller != "jog" or not (self.adapt or self.valves)

@@ -81,6 +81,7 @@ class Command:
         check(len(machine.driven) > 0, "--machine", "a driven joint or more", "none")
         speed, ticks = machine.tool_speed, machine.history
         check(speed <= 10, "--machine", "tool_speed in m/s, up to 10", speed)
+        check(1 <= machine.rate <= 1000, "--machine", "a rate of 1 to 1000 Hz", machine.rate)
         check(ticks <= MOST_TICKS, "--machine", f"a history of up to {MOST_TICKS} ticks", ticks)
         for j in machine.joints:
             for field, most in LARGEST.items():
@@ -158,7 +159,7 @@ def find_plant(name: str, machine: Machine) -> Plant:
     plant = OwnPlant(name, load_object("--plant", name))
     low, high = machine.column("q_min"), machine.column("q_max")
     ways = np.vstack([np.eye(machine.n), -np.eye(machine.n)])
-    q = np.tile((low + high) / 2, (len(ways), 1))
+    q = np.tile(0.6 * low + 0.4 * high, (len(ways), 1))
     state = plant.reset(machine, q.copy())
     there = np.allclose(state.q, q, rtol=0, atol=0.01)
     require(there, name, "a reset to the angles that are given", brief(np.asarray(state.q)[0]))

@@ -19,7 +19,7 @@ from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.identification.net_file import fingerprint, select_nets
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
-from brokk_min.machine import Array, Controller, Machine, require
+from brokk_min.machine import Array, Controller, Machine, is_row, require
 from brokk_min.settings import TaskConfig
 
 BY_HAND, RAW = "pid_by_hand", "pid_by_hand_raw"
@@ -234,11 +234,14 @@ def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> Baselines:
     with expected(path, "gains of `reproduce` or `evaluate --save-gains`"):
         file = json.loads(path.read_text("utf-8"))
         expect_same(path, file["meta"], gains_metadata(machine, net))
-        gains = {}
+        gains, every = {}, (RAW, BY_HAND, *TUNED)
+        missing = [name for name in every if name not in file["gains"]]
+        require(not missing, str(path), f"gains of {', '.join(every)}", f"none of {missing}")
         for name, row in file["gains"].items():
             kind = StrongGains if name == STRONGEST else Gains
-            arrays = {key: np.array(values, float) for key, values in row.items()}
-            finite = all(np.isfinite(array).all() for array in arrays.values())
-            require(finite, f"{path}: {name}", "finite numbers", "others")
-            gains[name] = kind(**arrays)
+            gains[name] = kind(**{key: np.array(values) for key, values in row.items()})
+            for key, values in row.items():
+                numbers = len(machine.driven) if key in ("kp", "ki", "kd") else 1
+                fits = is_row(values, numbers) and min(values) >= 0
+                require(fits, f"{path}: {name}: {key}", f"{numbers} numbers from 0 on", values)
         return baselines(machine, net, gains)

@@ -16,7 +16,7 @@ from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import POLICIES, load_policy
 from brokk_min.learning.recipes import Recipe
-from brokk_min.machine import Controller, Machine
+from brokk_min.machine import Controller, Machine, require
 
 
 def sweep(
@@ -37,6 +37,10 @@ def sweep(
     folder (None: this machine). With a folder `beside` of `reproduce`, or of the package,
     `robustness.json` has the mean errors on changed machines, too.
     """
+    others = {name: file for name, file in POLICIES.items() if name != "rl"}
+    for file in (*others.values(), "gains.json") if beside else ():
+        there = beside is None or (beside / file).exists()
+        require(there, f"--robustness {beside}", f"a folder of `reproduce`, with {file}", "none")
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
     done = side_by_side({str(seed): partial(job, seed) for seed in seeds}, None, scheduler)
@@ -50,10 +54,9 @@ def sweep(
     write_json(out / "sweep.json", {"meta": meta, "table": table, "runs": rows})
     if beside:
         policies = {f"seed {seed}": out / f"seed_{seed}.npz" for seed in seeds}
-        others = {name: beside / file for name, file in POLICIES.items() if name != "rl"}
-        gains = beside / "gains.json"
         score = partial(vary, machine, net, min(starts, 16))
-        every = policies | others | {"pids": gains}
+        rivals = {name: beside / file for name, file in (others | {"pids": "gains.json"}).items()}
+        every = policies | rivals
         jobs = {name: partial(score, name, file) for name, file in every.items()}
         cases = side_by_side(jobs, None, scheduler)
         meta |= {"starts": min(starts, 16)}
@@ -75,7 +78,7 @@ def run_seed(
     file = out / f"seed_{seed}.npz"
     if file.exists():
         policy = load_policy(file, machine)
-        training = {"actuator": fingerprint(net), "recipe": asdict(recipe)}
+        training = {"actuator": fingerprint(net), "recipe": asdict(recipe), "seed": seed}
         expect_same(file, policy.training, training)
     else:
         policy = train_policy(machine, net, recipe, seed, file)

@@ -45,6 +45,8 @@ def net_from_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, 
         net = kind(**{field.name: found[field.name] for field in fields(kind)})
         inputs = net.input_scale.shape[-1]
         require(3 * net.history <= inputs, "history", f"samples of {inputs} inputs", net.history)
+        order = bool((vars(net)["output_low"] < vars(net)["output_high"]).all())
+        require(order, "output_low", "less than output_high", "as much or more")
         scaled = bool((net.input_scale > 0).all())
         require(scaled, "input_scale", "positive numbers", net.input_scale.min())
         net.predict(np.zeros((1, len(net.joints), 3, net.history), np.float32))  # do shapes fit?

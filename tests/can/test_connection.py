@@ -52,6 +52,13 @@ def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
         bus.bus.shutdown, shutdown = raises(can.CanOperationError("gone")), bus.bus.shutdown
     shutdown()
     assert (tmp_path / "l").read_text().endswith(" v 080# T\n")
+    with (
+        pytest.raises(ValueError, match="no answer"),
+        open_bus("virtual", "v", tmp_path / "m") as bus,
+    ):
+        bus.send(0x080, b"")
+        raise ValueError("no answer")
+    assert not (tmp_path / "m").exists()  # nobody else sent, so it would only be in the way
     with pytest.raises(IsADirectoryError), open_bus("virtual", "v", tmp_path):
         raise AssertionError("a log in the place of a folder")
 

@@ -105,6 +105,7 @@ def test_find_machine__takes_a_name_or_an_object_of_a_file(file):
     ("changes", "message"),
     [
         ("tool_speed=400.0", "tool_speed in m/s, up to 10, got 400.0"),
+        ("rate=0.04", "a rate of 1 to 1000 Hz, got 0.04"),
         ("history=10**9", "a history of up to 1000 ticks, got 1000000000"),
         ("joints=(replace(TILT, alpha=90),)", "q2.alpha in rad .*, up to 6.3, got 90: degrees"),
         ("joints=(replace(TILT, q_dot_up=24.0),)", r"q2.q_dot_up in rad \(m\), up to 10, got 24"),

@@ -74,6 +74,16 @@ def test_tuning_cost__is_the_mean_error_of_each_row_of_gains():
         ('"machine": "brokk170"', '"machine": "digger"', "machine: expected 'brokk170', got 'dig"),
         ('"actuator": "', '"actuator": "0', r"actuator: expected '\w+', got '0\w+'"),
         ('"kp"', '"kq"', "expected gains of"),
+        (
+            '"gains": {',
+            '"gains": {}, "others": {',
+            "expected gains of pid_by_hand_raw, pid_by_hand, j",
+        ),
+        (
+            '"kp": [',
+            '"kp": [1.0,',
+            r"pid_by_hand_raw: kp: expected 4 numbers from 0 on, got \[1.0,",
+        ),
     ],
 )
 def test_read_gains__reads_what_was_written_of_the_machine_alone(tmp_path, old, new, message):

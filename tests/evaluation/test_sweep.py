@@ -89,3 +89,9 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
     told = r"seed_4\.npz: recipe: task: episode_s: expected 0\.8, got 20\.0"
     with pytest.raises(ValueError, match=told):
         sweep.run_seed(BROKK_170, NET, other, out, 2, 4)
+    (out / "seed_3.npz").rename(out / "seed_7.npz")
+    with pytest.raises(ValueError, match=r"seed_7\.npz: seed: expected 7, got 3"):
+        sweep.run_seed(BROKK_170, NET, RECIPE, out, 2, 7)
+    with pytest.raises(ValueError, match=r"of `reproduce`, with policy_paper\.npz, got none"):
+        sweep.sweep(BROKK_170, NET, RECIPE, [8], tmp_path / "new", 2, beside=out)
+    assert not (tmp_path / "new").exists()

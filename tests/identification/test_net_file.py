@@ -48,6 +48,9 @@ def test_load_net__names_file_and_fault(tmp_path, change, message):
     )
     with pytest.raises(ValueError, match="input_scale: expected positive numbers, got"):
         load_net(path)
+    save_arrays(path, "actuator net 6", header, **arrays | {"output_low": arrays["output_high"]})
+    with pytest.raises(ValueError, match="output_low: expected less than output_high, got"):
+        load_net(path)
 
 
 def test_fingerprint__differs_between_nets():
