@@ -98,6 +98,10 @@ def lacks(name: str, r: JointReport) -> Iterator[Check]:
     tiny = 0 < largest < SMALL  # of another unit, so small that they look like none
     missing = r.idle and not (r.follows or r.other or one_sided(r) or tiny)
     yield missing, f"u_{name}", "commands where it moves", got
+    got = f"another in {brief(list(r.scaled))}: another unit, or engine speed?"
+    yield r.scaled, f"u_{name}", "one scale in all recordings", got
+    got = f"another in {brief(list(r.later))}: another clock?"
+    yield r.later, name, "one delay in all recordings", got
     wanted = "commands in parts of full command, up to 1"
     small = largest < SMALL and not missing
     yield small, f"u_{name}", wanted, f"at most {largest:.2g}: another unit?"

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from brokk_min.fit import COMMANDED, MOVED, Log, Recording, Samples, join_recordings, moving
 from brokk_min.identification.joint_model import (
+    LATEST,
     OPENS,
     ZONES,
     Model,
@@ -24,6 +25,8 @@ from brokk_min.identification.joint_model import (
     means,
     motion_of,
     reach,
+    responses,
+    with_gains,
 )
 from brokk_min.machine import Array, Machine
 
@@ -42,6 +45,9 @@ AT_LEAST = (0.9, 0.3)  # s, if less or more of the motion is explained than
 WELL = 0.9  # as without noise, without coarse steps, and where valves open at once
 SHORTEST = 5.0  # s, of a recording whose sign is looked at
 RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
+BETTER, NEARLY = 0.15, 0.92  # more by other gains, and all; of sound recordings never over 0.89
+MUCH_BETTER = 0.27  # more by another delay; of sound sines up to 0.22
+LEAST_MOTION = 0.1  # of the fastest, in a recording that tells its scale and delay
 SAME, ROUNDED = 20, 1e-3  # samples of the same commands, and rad, up to which motion is the same
 LEAST_EXPLAINED = 0.6  # of a joint's motion by its commands; of sound logs of ours 0.84
 FOLLOWS = 0.8  # of a joint's motion without commands, that another joint explains
@@ -70,6 +76,8 @@ class JointReport(NamedTuple):
     idle: tuple[str, ...] = ()  # recordings in which it moves without commands
     rest: float = 0.0  # the command at which it rests, if that is clearly not 0
     one_size: bool = False  # are all commands in a direction of one size?
+    scaled: tuple[str, ...] = ()  # recordings that another scale of commands explains better
+    later: tuple[str, ...] = ()  # and another delay
     early: float = 0.0  # s, by which it moves before its commands, if that explains more
 
 
@@ -110,6 +118,11 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     }
     other = max(by, key=lambda name: by[name], default="")
     driven = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
+    strong = LEAST_MOTION * np.abs(motion.velocity).max()
+    parts = ((one, motion_of([one], j, rate, span)) for one in kept)
+    alone = [
+        (one, part) for one, part in parts if part.counts.sum() > LONG * rate and rms(part) > strong
+    ]
     second = means(every := motion_of(recordings, j, rate, span), every.u, 1.0)
     coarse = (means(motion, x, COARSE) for x in (motion.velocity, expected_velocity(motion, model)))
     return JointReport(
@@ -138,7 +151,29 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         rest=rest_of(motion_of(list(log.recordings), j, rate, span)),
         one_size=switched,
         early=earlier(motion, model),
+        scaled=tuple(one.name for one, part in alone if another_scale(part, model)),
+        later=tuple(one.name for one, part in alone if another_delay(part, model)),
     )
+
+
+def rms(motion: Motion) -> float:
+    """The root of the mean square of the velocities that count [rad/s]."""
+    return float(np.sqrt(np.square(motion.velocity).sum() / motion.counts.sum()))
+
+
+def another_scale(motion: Motion, model: Model) -> bool:
+    """Do other gains explain nearly all of a motion, and those of the model clearly less?"""
+    own = with_gains(motion, model.lag, model.zones, responses(motion, model.lag[1], model.zones))
+    given = explained_part(motion.velocity, expected_velocity(motion, model))
+    return own.explained > max(given + BETTER, NEARLY)
+
+
+def another_delay(motion: Motion, model: Model) -> bool:
+    """Does another delay explain much more of a motion? Slow and single sines fit several."""
+    delays = range(round(LATEST * motion.rate) + 1)
+    lags = [model._replace(lag=(delay, model.lag[1])) for delay in delays]
+    parts = [explained_part(motion.velocity, expected_velocity(motion, of)) for of in lags]
+    return max(parts) > max(parts[model.lag[0]] + MUCH_BETTER, LEAST_EXPLAINED)
 
 
 def sign(u: Array, q_dot: Array, rate: float, least: float = CLEAR_SIGN) -> int:

@@ -288,6 +288,23 @@ def test_inspect__names_recordings_without_commands():
     assert inspect(log_of(*(record("boom", u) for u in SEVEN), parked))["boom"].idle == ()
 
 
+def test_inspect__names_recordings_of_another_scale_or_delay():
+    """Half of the commands, or a clock that is 0.3 s off, in one of seven recordings."""
+
+    def last(change):
+        each = [record("boom", u)._replace(name=str(i)) for i, u in enumerate(SEVEN)]
+        return inspect(log_of(*each[:6], change(each[6])))["boom"]
+
+    sound = last(lambda one: one)
+    half = last(lambda one: one._replace(u=0.5 * one.u))
+    late = last(lambda one: one._replace(u=np.append(one.u[6:], 0 * one.u[:6], axis=0)))
+    found = [(report.scaled, report.later) for report in (sound, half, late)]
+    assert found == [((), ()), (("6",), ()), ((), ("6",))]
+    told = [*warnings(log_of(), {"boom": half, "arm": late}, None)]
+    assert any(text.startswith("u_boom: expected one scale in all recordings") for text in told)
+    assert any(text.startswith("arm: expected one delay in all recordings") for text in told)
+
+
 def test_inspect__does_not_name_a_recording_for_its_last_samples():
     """In 0.3 s a valve that was closed does not open."""
     last = record("boom", np.append(np.full(200, 0.05), np.full(6, -0.6)))
