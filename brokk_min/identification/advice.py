@@ -8,7 +8,13 @@ import numpy as np
 
 from brokk_min._files import brief
 from brokk_min.fit import MOVED, Log
-from brokk_min.identification.inspection import COARSE, LEAST_EXPLAINED, JointReport, repeated
+from brokk_min.identification.inspection import (
+    COARSE,
+    FASTEST,
+    LEAST_EXPLAINED,
+    JointReport,
+    repeated,
+)
 from brokk_min.identification.joint_model import LATEST, OPENS
 from brokk_min.machine import PWM_MAX, Joint, Machine
 
@@ -21,6 +27,7 @@ COARSER = 0.15  # more of the coarse motion is explained: angles have noise or s
 ZONE = 0.04  # of full command, between the dead zones of machine and log
 WORSE = 1.25  # times as much is not explained with the machine's dead zones
 ONE_SIDED = 0.8  # of a joint's motion; of sound logs 0.84 is explained
+UNITS, SPEED = 10.0, 3.0  # times as fast as the next recording, and rad/s: no machine is that
 SMALL = 0.05  # of full command: no machine is driven by less
 FASTER, SLOWER = 1.2, 0.4  # of the machine's fastest motion, which are in the log
 FAST, PART = 0.5, 0.3  # of it, by so small a part of the largest command
@@ -171,6 +178,20 @@ def copied(log: Log) -> list[tuple[str, str]]:
     ]
 
 
+def mixed_units(log: Log) -> dict[str, str]:
+    """Joints that are so much faster in some recordings that these are in degrees: in words."""
+    told = {}
+    for j, name in enumerate(log.joints):
+        fast = {one.name: np.quantile(np.abs(one.q_dot[:, j]), FASTEST) for one in log.recordings}
+        speeds = np.sort([MOVED, *(x for x in fast.values() if x > MOVED)])[1:]
+        leap = np.flatnonzero(speeds[1:] > UNITS * speeds[:-1])[-1:]  # the last one, if any
+        if leap.size and speeds[-1] > SPEED:
+            names = brief([one for one, speed in fast.items() if speed > speeds[leap[0]]])
+            got = f"larger angles in {names}: degrees?"
+            told[name] = f"q_{name}: expected one unit in all recordings, got {got}"
+    return told
+
+
 def warnings(
     log: Log, reports: Mapping[str, JointReport], machine: Machine | None
 ) -> Iterator[str]:
@@ -179,6 +200,8 @@ def warnings(
     if twins := repeated(log.recordings, ()):
         yield f"recordings: expected each once, got again {brief(twins)}"
     yield from wrong_signs(reports)
+    mixed = mixed_units(log)
+    yield from mixed.values()
     copies = {name for pair in copied(log) for name in pair}
     for one, other in copied(log):
         yield f"q_{other}: expected a column of its own, got that of q_{one}"
@@ -186,6 +209,8 @@ def warnings(
         if name not in reports:
             yield f"{name}: expected commands in the log, got none"
     for name, r in reports.items():
+        if name in mixed:
+            continue
         if r.high - r.low <= MOVED:
             yield f"q_{name}: expected motion, got {r.low:.3g} to {r.high:.3g}"
             continue

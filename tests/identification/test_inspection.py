@@ -9,7 +9,7 @@ import pytest
 from brokk_min.actuator import PLANT
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.fit import SINE, Log, Recording, collect, velocity_of
-from brokk_min.identification.advice import resting, table, warnings, wrong_signs
+from brokk_min.identification.advice import mixed_units, resting, table, warnings, wrong_signs
 from brokk_min.identification.inspection import JointReport, inspect, repeated
 from brokk_min.identification.validation import task_log
 from brokk_min.machine import BROKK_170
@@ -222,15 +222,28 @@ def test_warnings__name_the_same_angle_in_two_columns():
     assert not any("60%" in text or "ground" in text for text in told)
 
 
+SEVEN = [holds(seed, 800, 20) for seed in range(7)]
+
+
+def test_warnings__name_recordings_in_degrees_among_others():
+    each = [record("boom", u)._replace(name=str(i)) for i, u in enumerate(SEVEN[:4])]
+    each[2:] = [one._replace(q=57.3 * one.q, q_dot=57.3 * one.q_dot) for one in each[2:]]
+    log = log_of(*each)
+    wanted = (
+        "q_boom: expected one unit in all recordings, got larger angles in ['2', '3']: degrees?"
+    )
+    assert mixed_units(log) == {"boom": wanted} and mixed_units(log_of(*each[:2])) == {}
+    told = [*warnings(log, inspect(log), None)]
+    assert [text for text in told if "boom" in text] == [wanted]
+    assert mixed_units(log_of(*each[2:])) == {}  # all of them
+
+
 def boom(*commands, change=lambda one: one):
     """The report of the boom, driven by each of these commands; `change` alters every third."""
     each = [record("boom", u) for u in commands]
     each[::3] = [change(one) for one in each[::3]]
     each = [one._replace(name=str(i), q_dot=velocity_of(one.q, 4)) for i, one in enumerate(each)]
     return inspect(log_of(*each))["boom"]
-
-
-SEVEN = [holds(seed, 800, 20) for seed in range(7)]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
