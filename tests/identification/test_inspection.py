@@ -284,6 +284,8 @@ def test_inspect__knows_that_zeros_and_signs_differ_between_recordings():
     moved = [one._replace(q=one.q + zero) for one, zero in zip(pushed, zeros, strict=True)]
     assert inspect(log_of(*pushed))["boom"].still == []
     assert inspect(log_of(*moved))["boom"].still == []
+    moved[0] = pushed[0]._replace(q=pushed[0].q + 0.1)  # a sixth of the range
+    assert inspect(log_of(*moved))["boom"].still == []
     raised = [one._replace(q=one.q + 0.5) for one in pushed]
     raised[2] = raised[2]._replace(q=-raised[2].q, q_dot=-raised[2].q_dot)
     report = inspect(log_of(*raised))["boom"]
