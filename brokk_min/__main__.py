@@ -46,7 +46,9 @@ def main(arguments: list[str] | None = None) -> int:
     if shutil.get_terminal_size().columns < NARROWEST:  # help of tyro would never end
         os.environ["COLUMNS"] = str(NARROWEST)
     if threading.current_thread() is threading.main_thread():  # elsewhere Python refuses
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it tidies up
+        for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+            if signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores the end of a terminal
+                signal.signal(number, signal.default_int_handler)  # as Ctrl-C: it tidies up
     name, *options = (sys.argv[1:] if arguments is None else arguments) or [""]
     try:
         if name in ("-h", "--help", "--version"):

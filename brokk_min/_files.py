@@ -72,6 +72,15 @@ def made_with() -> dict[str, str | None]:
 
 
 @contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Give the name of a file to the OSErrors of writing it, as of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+@contextmanager
 def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """A temporary file, text in UTF-8, that replaces `path` if the block ends without an error.
 
@@ -83,18 +92,17 @@ def whole_file(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     target = path.resolve()  # of a link
     temporary = target.with_name(f".{target.name[:100]}.{os.getpid()}")
     try:
-        with open(temporary, mode, encoding=None if "b" in mode else "utf-8") as file:
-            with suppress(OSError):  # no file is there yet, or a disk without modes
-                shutil.copymode(target, temporary)
-            yield file
-        if target in NEW and target.exists():
-            ours = target.with_name(f"{target.stem}-{os.getpid()}{target.suffix}")
-            os.replace(temporary, ours)
-            require(False, str(path), "no file, as at the start", f"one; the new one is {ours}")
-        os.replace(temporary, target)
-        NEW.discard(target)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        with named(path):
+            with open(temporary, mode, encoding=None if "b" in mode else "utf-8") as file:
+                with suppress(OSError):  # no file is there yet, or a disk without modes
+                    shutil.copymode(target, temporary)
+                yield file
+            if target in NEW and target.exists():
+                ours = target.with_name(f"{target.stem}-{os.getpid()}{target.suffix}")
+                os.replace(temporary, ours)
+                require(False, str(path), "no file, as at the start", f"one; the new one is {ours}")
+            os.replace(temporary, target)
+            NEW.discard(target)
     finally:
         with suppress(OSError):
             temporary.unlink()

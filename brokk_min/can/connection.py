@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brokk_min._files import brief, require_package
+from brokk_min._files import brief, named, require_package
 from brokk_min.can.canopen import LATENESS, OPERATOR_INPUT, VALVES, WOULD_SEND, Frame, OperatorInput
 
 
@@ -83,7 +83,8 @@ class Bus:
 
     def flush(self) -> None:
         """Write the log on, so that it survives the program's sudden end. OSError: a full disk."""
-        self.writer.file.flush()
+        with named(self.log):
+            self.writer.file.flush()
 
     def _message(self, can_id: int, data: bytes) -> Any:
         message = self.can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
@@ -99,7 +100,8 @@ class Bus:
         try:
             self.bus.shutdown()
         finally:
-            self.writer.stop()
+            with named(self.log):
+                self.writer.stop()
 
 
 def plain_frame(message: Any) -> Frame:

@@ -133,6 +133,9 @@ class Sweep(Training):
         from brokk_min.evaluation.sweep import sweep
 
         check(self.seeds > 0, "--seeds", "1 or more", self.seeds)
+        file = self.out / "sweep.json"  # one that goes on has policies beside it
+        free = self.force or not file.exists() or any(self.out.glob("seed_*.npz"))
+        check(free, str(file), "no file (or --force)", "one that `sweep` did not write")
         seeds = range(self.seed, self.seed + self.seeds)
         task = machine, self.find_net(machine), recipe, seeds, self.out, self.num_starts
         table = sweep(*task, self.scheduler, self.robustness)

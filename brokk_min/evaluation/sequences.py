@@ -127,7 +127,7 @@ def evaluation_starts(machine: Machine, num: int, commands: Sequence[Commands], 
         return draw_starts(machine, num, commands, seed)
     path = SHIPPED / machine.name / "starts.csv"
     starts = read_starts(path, machine)
-    require(num <= len(starts), path.name, f"at most {len(starts)} starts", num)
+    require(num <= len(starts), "--num-starts", f"at most the {len(starts)} of {path.name}", num)
     return starts[:num]
 
 

@@ -44,6 +44,14 @@ def test_bus__marks_foreign_frames_and_echoes_and_logs_all_but_echoes():
     assert re.fullmatch(r"\(\d+\.\d{6}\) timing 7FD#3408000000000000 T", lines[-1])
 
 
+def test_open_bus__names_its_log_where_a_disk_is_full():
+    with pytest.raises(OSError, match="/dev/full"), open_bus("virtual", "v", "/dev/full") as bus:
+        bus.heard = True  # so the log stays
+        bus.send(0x080, b"")
+        with pytest.raises(OSError, match="/dev/full"):
+            bus.flush()
+
+
 def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
     """An adapter that was pulled out fails at the shutdown, too."""
     refusal = r"virtual v: expected a CAN bus that works, got gone$"

@@ -122,7 +122,7 @@ def test_version__is_that_of_the_project_and_of_its_citation(capsys):
     assert f"\nversion: {brokk_min.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals__end_a_command_in_one_line(number, monkeypatch, capsys):
     collect = "brokk_min.cli.identification.Collect.__call__"
     monkeypatch.setattr(collect, lambda *_: signal.raise_signal(number))

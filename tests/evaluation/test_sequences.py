@@ -98,7 +98,9 @@ def test_evaluation_starts__of_the_package_are_those_of_reproduce(monkeypatch):
     for sequence in sequences:
         goals = sequence.for_starts(BROKK_170, starts)
         assert s.feasible(BROKK_170, starts, goals).all(), sequence.name
-    with pytest.raises(ValueError, match=r"starts.csv: expected at most 32 starts, got 33"):
+    with pytest.raises(
+        ValueError, match=r"--num-starts: expected at most the 32 of starts.csv, got 33"
+    ):
         s.evaluation_starts(BROKK_170, 33, [], 0)
 
 

@@ -95,3 +95,6 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
     with pytest.raises(ValueError, match=r"of `reproduce`, with policy_paper\.npz, got none"):
         sweep.sweep(BROKK_170, NET, RECIPE, [8], tmp_path / "new", 2, beside=out)
     assert not (tmp_path / "new").exists()
+    (beside / "sweep.json").write_text("of somebody else")
+    assert run(f"{command} --out {beside}") == 2
+    assert "got one that `sweep` did not write" in capsys.readouterr().err
