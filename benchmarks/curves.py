@@ -29,7 +29,7 @@ from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.machine import BROKK_170 as M
 
 RUNS = 32  # of 20 s, for each point
-PAPER_STEPS = 7_000_000  # of 75 million: enough to be better than the optimised PID
+PAPER_STEPS = 7_000_000  # of 40 million: enough to be better than the optimised PID
 GROWTH = 1.2  # of the steps between two points
 Curve = list[tuple[float, float, float]]  # steps, seconds of CPU, error [m/s]
 

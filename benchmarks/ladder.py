@@ -28,6 +28,7 @@ from brokk_min.learning.checkpoint import train_policy
 from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.machine import BROKK_170 as M
+from brokk_min.settings import PPOConfig
 
 FIGURES = ("velocity_error_mean", "off_axis_drift_max", "valve_travel", "jerk_rms")
 STEPS = {
@@ -38,6 +39,7 @@ STEPS = {
     "cost": "costs of large commands, valve travel and error integral",
     "settings": "our settings of task and learner, and Muon",
 }
+BY_ADAM = PPOConfig(gamma=0.95, gae_lambda=1.0, log_std_end=-4.2)  # of groups without our settings
 RUNGS = {"the paper's agent": frozenset[str]()}
 RUNGS |= {f"alone: {text}": frozenset([k]) for k, text in STEPS.items() if k != "settings"}
 RUNGS |= {
@@ -60,9 +62,11 @@ def climb(name: str, nets: dict[str, ActuatorNet], total_steps: int, seed: int) 
     """`FIGURES` of one new policy on the machine."""
     steps = RUNGS[name]
     policy.INTERFACES[name] = interface_of(steps)  # of this process
-    recipe = find_recipe(paper="settings" not in steps, critic="groups" not in steps)
-    learner = replace(recipe.learner, total_steps=total_steps)
-    recipe = replace(recipe, interface=name, learner=learner)
+    ours, critic = "settings" in steps, "groups" not in steps
+    recipe = find_recipe(paper=not ours, critic=critic)
+    learner = recipe.learner if ours or critic else BY_ADAM
+    learner = replace(learner, total_steps=total_steps)
+    recipe = replace(recipe, interface=name, learner=learner, muon=ours)
     net = nets["net" if "nets" in steps else "net_paper"]
     return figures(train(net, recipe, seed), PLANT)
 

@@ -19,13 +19,11 @@ class Recipe:
 def find_recipe(paper: bool = False, critic: bool = False) -> Recipe:
     """The recipe of our agent or of the paper's, with advantages by groups or by a critic."""
     task = TaskConfig() if paper else TaskConfig(hold_min_s=0.5, hold_max_s=3.0)
+    learner = PPOConfig(40_000_000, gamma=0.95, gae_lambda=1.0, log_std=-2.0, log_std_end=-4.5)
+    learner = replace(learner, learning_rate=2e-3, target_kl=0.06)
     if critic:
         learner = PPOConfig()
-    elif paper:
-        learner = PPOConfig(75_000_000, gamma=0.95, gae_lambda=1.0, log_std_end=-4.2)
-    else:
-        learner = PPOConfig(5_000_000, horizon=12, minibatch_size=1024, log_std_end=-4.5)
-        learner = replace(learner, gamma=0.94, gae_lambda=1.0, log_std=-2.0)
-        learner = replace(learner, learning_rate=2e-3, target_kl=0.06)
-    muon = not (paper or critic)
-    return Recipe("paper" if paper else "beyond", critic, task, learner, muon)
+    elif not paper:
+        learner = replace(learner, total_steps=5_000_000, horizon=12, minibatch_size=1024)
+        learner = replace(learner, gamma=0.94)
+    return Recipe("paper" if paper else "beyond", critic, task, learner, muon=not critic)
