@@ -32,7 +32,7 @@ from brokk_min.learning.recipes import Recipe, find_recipe
 from brokk_min.machine import Array, Machine
 from brokk_min.settings import TaskConfig
 
-# beyond the chain's: sixth in error of the seeds 0 to 9, of `rl_critic` third of 0 to 3
+# beyond the chain's: sixth in error of the seeds 0 to 9 of `sweep`, of `rl_critic` third of 0 to 3
 SEEDS = {"rl": 8, "rl_paper": 9, "rl_critic": 3}
 PAIRS = (  # of a policy and a PID, that the pages compare
     ("rl_critic", baselines.BY_HAND),

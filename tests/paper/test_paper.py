@@ -215,7 +215,7 @@ def machines() -> list[list[str]]:
 def seeds() -> list[list[str]]:
     """Figures over training seeds."""
     rows = [["controller", "seeds", "velocity error [m/s]", "drift [m]"]]
-    for name in ("rl", "rl_critic_nets"):
+    for name in ("rl", "rl_paper", "rl_critic_nets"):
         content = shipped(f"seeds_{name}.json")
         number = str(len(content["meta"]["seeds"]))
         of = content["table"]["along"]
