@@ -244,9 +244,10 @@ def start_pose(machine: Machine) -> Array:
 def run_machine(
     machine: Machine, interface: str, channel: str, plant: Plant, faults: list[Fault]
 ) -> None:
-    """Run a simulated machine on a bus until a signal; it prints why its valve controller stops."""
+    """Run a simulated machine on a bus until a signal; it says why its valve controller stops."""
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:
+        print(f"{machine.name} on {interface} {channel}; Ctrl-C ends it", flush=True)
         serve(FaultyMachine(machine, start_pose(machine), bus.now(), plant, faults), bus, signals)
 
 

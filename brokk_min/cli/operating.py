@@ -48,7 +48,6 @@ class Simulate(Command):
     def __call__(self, machine: Machine) -> None:
         faults = [fault for text in self.fault for fault in parse_fault(machine, text)]
         plant = find_plant(self.plant, machine)
-        print(f"{self.machine} on {self.interface} {self.channel}; Ctrl-C ends it", flush=True)
         run_machine(machine, self.interface, self.channel, plant, faults)
 
 

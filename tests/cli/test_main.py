@@ -171,7 +171,8 @@ VIRTUAL = "drive --interface virtual --channel v"
 def test_wrong_use__is_refused_in_one_line(line, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(line) == status
-    (refusal,) = capsys.readouterr().err.splitlines()
+    printed, refusal = capsys.readouterr()
+    assert refusal.count("\n") == 1 and not printed
     assert refusal.startswith("brokk-min: ") and message in refusal
     assert not list(tmp_path.iterdir())
 
