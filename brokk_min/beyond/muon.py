@@ -8,8 +8,7 @@ matrix whose singular values are all one, so small directions of M count as much
 where `size` is the longer side of W, which makes steps as large as Adam's. Biases stay zero.
 
 What it buys: together with our settings of task and learner it takes the velocity error of the tool
-from 0.0144 to 0.0127 m/s after one million steps (the last step of `benchmarks.ladder`). With the
-paper's observation 40 million steps are enough where Adam took 75 million (`learning.recipes`).
+from 0.0144 to 0.0127 m/s after one million steps (the last step of `benchmarks.ladder`).
 
 Who was first: Jordan et al. (2024, kellerjordan.github.io/posts/muon); the length of the steps is
 by Liu et al. (2025, arXiv 2502.16982). `torch.optim.Muon` has both, but casts each matrix to
