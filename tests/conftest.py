@@ -1,11 +1,9 @@
-"""Order and threads of tests; profiles of Hypothesis.
+"""Order of tests; profiles of Hypothesis.
 
 Of these `ci` repeats itself bit for bit, `dev` explores, and `deep` does so for long.
 """
 
 import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy, for the whole run
 
 import pytest
 from hypothesis import HealthCheck, settings

@@ -183,13 +183,16 @@ def encoder_raw(machine: Machine, counts: ArrayLike) -> Counts:
     return np.asarray((sign * np.asarray(counts) + zero) % 2**POSITION_BITS)
 
 
+CRC_OF = np.arange(256)  # the remainder of each byte, divided by the polynomial 0x1D
+for _ in range(8):
+    CRC_OF = (CRC_OF << 1 ^ np.where(CRC_OF & 0x80, 0x1D, 0)) & 0xFF
+
+
 def checksum(frame: ArrayLike) -> Counts:
     """CRC-8 SAE J1850 of bytes (..., k), (...): polynomial 0x1D, start and final XOR 0xFF."""
     crc = np.array(0xFF)
     for byte in np.moveaxis(np.asarray(frame, int), -1, 0):
-        crc = crc ^ byte
-        for _ in range(8):
-            crc = (crc << 1 ^ np.where(crc & 0x80, 0x1D, 0)) & 0xFF
+        crc = CRC_OF[crc ^ byte]
     return crc ^ 0xFF
 
 

@@ -54,7 +54,7 @@ def net_claims(nets: Tests, gap: Gap) -> list[dict[str, Any]]:
     idle, moving = (response_time(*curve) for curve in nets["past movement"].values())
     errors = np.linalg.norm(gap.p_tool, axis=-1).mean(axis=0)  # m, of each run
     table: dict[str, dict[str, float | None]] = {
-        "gravity": {"down over up": float(down / up)},
+        "gravity": {"down over up": float(down / up) if up else None},
         "idle": {"idle over moving": idle / moving if idle and moving else None},
         "gap": {"in the figure": float(errors[0]), "median of runs": float(np.median(errors))},
     }

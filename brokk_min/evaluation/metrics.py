@@ -127,18 +127,22 @@ def evaluate(
     together, rng = Together([*controllers.values()]), np.random.default_rng(seed)
     batch = tqdm(each_tick, "evaluate", unit="tick", disable=None)
     every = rollout(machine, together, q, batch, noise, rng, plant, len(controllers))
-    rows: Table = []
     traces: dict[tuple[str, str], Trace] = {}
     for i, (name, (sequence, goal)) in enumerate(product(controllers, goals.items())):
         part = slice(i * len(starts), (i + 1) * len(starts))
-        trace = Trace(*(array[: len(goal), part] for array in every))
-        columns = metrics(machine, trace, goal, p_start)
-        for start in range(len(starts)):
-            labels = {"controller": name, "sequence": sequence, "start": start}
-            row = {key: float(of[start]) for key, of in columns.items()}
-            figures = {key: None if np.isnan(x) else x for key, x in row.items()}
-            rows.append(labels | {"kind": "workspace"} | figures)
-        traces[name, sequence] = trace
+        traces[name, sequence] = Trace(*(array[: len(goal), part] for array in every))
+    figures = {}
+    for sequence, goal in goals.items():  # of all controllers at once
+        each = zip(*(traces[name, sequence] for name in controllers), strict=True)
+        trace = Trace(*(np.concatenate(arrays, axis=1) for arrays in each))
+        driven = np.tile(goal, (1, len(controllers), 1)), np.tile(p_start, (len(controllers), 1))
+        columns = metrics(machine, trace, *driven)
+        figures[sequence] = {key: of.reshape(-1, len(starts)) for key, of in columns.items()}
+    rows: Table = []
+    for (c, name), sequence, start in product(enumerate(controllers), goals, range(len(starts))):
+        labels = {"controller": name, "sequence": sequence, "start": start, "kind": "workspace"}
+        row = {key: float(of[c, start]) for key, of in figures[sequence].items()}
+        rows.append(labels | {key: None if np.isnan(x) else x for key, x in row.items()})
     return rows, traces
 
 

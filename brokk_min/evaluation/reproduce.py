@@ -143,8 +143,8 @@ def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
         "net_paper": partial(fit_net, chain, "net_paper", paper_log, fitting.PAPER_RECIPE),
         "rl_paper": partial(train_one, chain, "rl_paper"),  # the longest first
         "rl_critic": partial(train_one, chain, "rl_critic"),
-        "rl": partial(train_one, chain, "rl"),
         "pids": partial(tune, effort=chain.budget.tuning, seed=chain.seed),
+        "rl": partial(train_one, chain, "rl"),
     }
     needs = {name: ["net"] for name in (*POLICIES, "pids")}
     needs |= {"net": [*members], "rl_critic": ["net_paper"]}

@@ -21,11 +21,11 @@ from brokk_min.identification.valve_report import KEPT, describe, from_log, load
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, valve_opening
 from brokk_min.settings import TaskConfig
-from tests.helpers_machines import Idle
+from tests.helpers_machines import Idle, coarse
 
 POLICY = load_policy(SHIPPED / "brokk170" / "policy.npz", BROKK_170)
 NET, DRIVEN = POLICY.net, BROKK_170.driven
-VARIED = variations(BROKK_170)
+VARIED = variations(coarse(BROKK_170, 0.0125))  # four Euler steps a tick: fast
 
 
 DRIVES = sequences.tuning_set(BROKK_170, 8, 55, 20.0)  # starts [rad], goals [m/s] of 20 s

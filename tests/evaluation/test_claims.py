@@ -43,6 +43,7 @@ def step(seconds):
     [
         ({}, [TRUE, TRUE, TRUE]),
         ({"down": 0.2}, [FALSE, TRUE, TRUE]),
+        ({"up": 0.0}, [UNKNOWN, TRUE, TRUE]),
         ({"idle": 0.15}, [TRUE, FALSE, TRUE]),
         ({"idle": None}, [TRUE, UNKNOWN, TRUE]),
         ({"median": 0.06}, [TRUE, TRUE, FALSE]),
@@ -50,8 +51,9 @@ def step(seconds):
     ],
 )
 def test_net_claims__hold_where_nets_behave_as_the_papers_machine(change, expected):
-    like = {"down": 0.45, "idle": 0.4, "figure": 0.03, "median": 0.02} | change
-    sweeps = {peak: (TIME, np.array([0.0, peak])) for peak in (0.1, 0.24, -like["down"], -0.3)}
+    like = {"up": 0.24, "down": 0.45, "idle": 0.4, "figure": 0.03, "median": 0.02} | change
+    peaks = 0.1, like["up"], -like["down"], -0.3
+    sweeps = {i: (TIME, np.array([0.0, peak])) for i, peak in enumerate(peaks)}
     nets = {
         "range and direction": sweeps,
         "past movement": {"idle": step(like["idle"]), "moving": step(0.1)},
@@ -62,8 +64,9 @@ def test_net_claims__hold_where_nets_behave_as_the_papers_machine(change, expect
     assert [claim["verdicts"] for claim in result] == [{"nets": text} for text in expected]
     assert [claim["figure"] for claim in result] == ["Fig. 2", "Fig. 2", "Fig. 5"]
     means = [n["mean"] for claim in result for n in claim["numbers"]["nets"].values()]
+    ratio = pytest.approx(like["down"] / like["up"]) if like["up"] else None
     times = like["idle"] and pytest.approx(like["idle"] / 0.1)
-    assert means == [pytest.approx(like["down"] / 0.24), times, *map(pytest.approx, distances[:2])]
+    assert means == [ratio, times, *map(pytest.approx, distances[:2])]
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from brokk_min.evaluation.sequences import read_starts, task_sequences
 from brokk_min.identification.fitting import OurFitConfig, fit_nets
 from brokk_min.identification.logs import read_log
 from brokk_min.identification.net_file import fingerprint, load_net
+from brokk_min.learning.jobs import side_by_side
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170
 
@@ -69,7 +70,12 @@ def results(folder):
 
 
 def test_reproduce__gives_the_same_results_twice(folder, tmp_path, monkeypatch, capsys):
-    """The second time by its command, as `--quick`, in several processes."""
+    """The second time by its command, as `--quick`; it learns in several processes."""
+
+    def learning_alone(calls, needs=None):
+        return side_by_side(calls, needs) if needs else one_by_one(calls)
+
+    monkeypatch.setattr(reproduce, "side_by_side", learning_alone)
     monkeypatch.setattr(reproduce, "QUICK", TINY)
     monkeypatch.setattr(report, "write_report", lambda *_: None)  # once is enough
     monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)  # the first time counts
