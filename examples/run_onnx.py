@@ -5,6 +5,7 @@ Run it as `python run_onnx.py FILE.onnx`, with what `brokk-min export` made of a
 """
 
 import json
+import signal
 import sys
 import time
 
@@ -14,7 +15,10 @@ import onnxruntime
 
 def load(path):
     """The net of a file and what the file tells of it."""
-    net = onnxruntime.InferenceSession(path)
+    try:
+        net = onnxruntime.InferenceSession(path)
+    except Exception as error:  # onnxruntime has one for each cause
+        sys.exit(f"{path}: expected a file of brokk-min export, got: {error}")
     told = {k: json.loads(text) for k, text in net.get_modelmeta().custom_metadata_map.items()}
     if told.get("interface") != "paper":
         sys.exit(f"{path}: expected a policy of train --paper, got {told.get('interface')}")
@@ -51,6 +55,7 @@ def tick(net, told, h, q, u, v_goal):
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit(__doc__)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a word
     net, told = load(sys.argv[1])
     q = np.array([(low + high) / 2 for *_, low, high, _ in told["geometry"]])  # rad
     u, dt = 0 * q, 1 / told["rate"]

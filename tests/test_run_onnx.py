@@ -1,6 +1,7 @@
 """`examples/run_onnx.py` sends what `Policy` sends, without this package."""
 
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -46,9 +47,13 @@ def test_commands__are_those_of_the_controller(machine, tmp_path):
     assert np.std(sent, axis=0)[machine.driven].min() > 0.005
 
 
-def test_our_agent__is_refused_in_one_line(tmp_path):
+def test_our_agent_and_other_files__are_refused_in_one_line(tmp_path):
     """It reads what it computes from memory, so NumPy alone would need its whole interface."""
     path = tmp_path / "p.onnx"
+    for write in (lambda: None, lambda: path.write_text("u")):
+        write()
+        with pytest.raises(SystemExit, match=f"^{path}: expected a file of brokk-min export, got"):
+            run_onnx.load(str(path))
     export_onnx(path, random_policy("beyond"))
     wanted = "expected a policy of train --paper, got beyond"
     with pytest.raises(SystemExit, match=f"^{path}: {wanted}$"):
@@ -59,13 +64,15 @@ def test_program__runs_where_this_package_cannot_be_imported(tmp_path):
     """On a policy that `brokk-min export` wrote; it prints a line each tick."""
     policy = SHIPPED / BROKK_170.name / "policy_paper.npz"
     assert run("export --policy", policy, "--out", tmp_path / "p.onnx") == 0
+    pipe = subprocess.PIPE
     command = [sys.executable, "-c", BLOCKED, PROGRAM, tmp_path / "p.onnx"]
-    started = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+    started = subprocess.Popen(command, text=True, cwd=tmp_path, stdout=pipe, stderr=pipe)
     try:
         printed = [started.stdout.readline() for _ in range(5)]
+        started.send_signal(signal.SIGINT)
+        assert started.communicate(timeout=60)[1] == ""  # Ctrl-C ends it without a word
     finally:
         started.kill()
-        started.communicate()
     assert all(re.fullmatch(r"u \[.*\] of full command, q \[.*\] rad\n", line) for line in printed)
 
 
