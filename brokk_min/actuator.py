@@ -5,6 +5,7 @@ sees the equations of the analytic one. The nets read a history, which holds ang
 command of the last 13 samples. `fit` makes nets from logs.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -99,7 +100,7 @@ def stands_in(machine: Machine) -> bool:
 
 @lru_cache
 def hydraulics_of(machine: Machine) -> Hydraulics:
-    """The hydraulics of a machine, by default plain ones.
+    """The hydraulics of a machine, by default plain ones, with whole steps in a tick.
 
     ValueError: no such name, a cylinder of no joint, no pair of speeds, a triangle that does not
     close, or a step that Euler cannot take.
@@ -107,7 +108,8 @@ def hydraulics_of(machine: Machine) -> Hydraulics:
     >>> hydraulics_of(BROKK_170).pump_flow
     0.00105
     """
-    h = Hydraulics() if machine.hydraulics is None else machine.hydraulics
+    plain = Hydraulics(dt=machine.dt / math.ceil(machine.dt / Hydraulics.dt - 1e-6))
+    h = plain if machine.hydraulics is None else machine.hydraulics
     if isinstance(h, str):
         require(h in HYDRAULICS, "hydraulics", f"one of {[*HYDRAULICS]}, or a value", h)
         h = HYDRAULICS[h]

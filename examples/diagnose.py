@@ -20,7 +20,7 @@ from brokk_min.can.drive_log import Telemetry, read_frames, read_telemetry
 from brokk_min.cli.options import Command
 from brokk_min.env import measure
 from brokk_min.learning.policy import Policy, load_policy
-from brokk_min.machine import PWM_MAX, Array, Machine
+from brokk_min.machine import PWM_MAX, Array, Machine, require
 
 # Thresholds between sound drives and planted faults; all are assumed.
 CLEARLY = 0.89  # of the error that is left: then a changed term explains something
@@ -45,8 +45,13 @@ def read_ticks(machine: Machine, log: Path) -> list[Telemetry]:
     """The longest stretch of ticks with all positions."""
     ticks = list(read_telemetry(machine, read_frames(log)))
     steps = np.diff([tick.time for tick in ticks])
-    gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) + 1
+    usual = np.median(steps) if len(steps) else 0.0
+    gaps = np.flatnonzero(steps > 1.5 * usual) + 1
     first, end = max(pairwise([0, *gaps, len(ticks)]), key=lambda ends: ends[1] - ends[0])
+    driving = sum(tick.driving for tick in ticks[first:end])
+    least = machine.history + round(2 * AHEAD * machine.rate)
+    wanted = f"{least} ticks or more, some of which drive"
+    require(end - first >= least and driving > 1, str(log), wanted, f"{end - first} and {driving}")
     return ticks[first:end]
 
 
@@ -176,4 +181,7 @@ def main(log: str, policy: str, name: str = "brokk170") -> None:
 if __name__ == "__main__":
     if not 3 <= len(sys.argv) <= 4:
         sys.exit(__doc__)
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except (OSError, ValueError) as error:
+        sys.exit(f"diagnose.py: {error}")

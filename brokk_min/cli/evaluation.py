@@ -1,11 +1,12 @@
 """The commands that compare: policies and baselines, the whole chain."""
 
+import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from brokk_min._files import require_package, write_json
+from brokk_min._files import require_package, whole_file, write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.can.operator_input import read_commands
 from brokk_min.cli.options import (
@@ -52,6 +53,9 @@ class Evaluate(Command):
         own: dict[str, Controller] = {}
         if self.controller:  # before PIDs are tuned
             own[self.controller] = own_controller(self.controller, machine, net)
+            moment = commands[0]._replace(goals=commands[0].goals[:2])
+            tried = {"": own_controller(self.controller, machine, net)}
+            metrics.evaluate(machine, tried, [moment], starts[:1], self.seed, plant)
         pids = self.pids(machine, net, plant, gains)
         controllers: dict[str, Controller] = {**policies, **pids, **own}
         if self.adapt:
@@ -77,6 +81,12 @@ class Evaluate(Command):
         if self.starts:
             return commands, sequences.read_starts(self.starts, machine)
         starts = sequences.evaluation_starts(machine, self.num_starts, own, self.seed + 2)
+        for one in commands if given else ():
+            follow = sequences.feasible(machine, starts, one.for_starts(machine, starts))
+            if not follow.all():
+                got = f"{sum(~follow)} of {len(starts)} that leave the arm's ranges or speeds"
+                wanted = f"starts from which the arm can follow {one.name} (--starts)"
+                print(f"warning: --commands: expected {wanted}, got {got}", file=sys.stderr)
         return commands, starts
 
     def pids(
@@ -122,9 +132,22 @@ class Reproduce(Command):
         budget = QUICK if self.quick else Budget()
         file = self.out / "results.json"
         check(self.force or not file.exists(), str(file), "no file (or --force)", "one")
-        log = self.out / "log.npz"  # a chain that was stopped has left another one beside it
-        free = self.force or not log.exists() or (self.out / "log_paper.npz").exists()
-        check(free, str(log), "no file (or --force)", "one that `reproduce` did not write")
+        kept = self.out / "chain.json"  # what a chain that was stopped leaves
+        chain = {"machine": repr(machine), "seed": self.seed, "budget": asdict(budget)}
+        text = json.dumps(chain, indent=1)
+        for name in ("log.npz", "net.npz", *POLICIES.values(), "gains.json"):
+            free = self.force or kept.exists() or not (self.out / name).exists()
+            got = "one that `reproduce` did not write"
+            check(free, str(self.out / name), "no file (or --force)", got)
+        checkpoints = [self.out / f"{name}.checkpoint" for name in POLICIES.values()]
+        if kept.exists() and kept.read_text("utf-8") != text:
+            for path in filter(Path.exists, checkpoints):
+                got = "one of a chain with another machine, seed or length"
+                check(self.force, str(path), "no file (or --force)", got)
+                path.unlink()
+        self.out.mkdir(parents=True, exist_ok=True)
+        with whole_file(kept, "w") as opened:
+            opened.write(text)
         results = reproduce(machine, self.out, budget, self.seed)
         print(table(results["task_space"]["runs"]), *results["trainings"], sep="\n")
         print(self.out / "report.html", file, sep="\n")

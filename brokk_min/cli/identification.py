@@ -62,7 +62,15 @@ class ReadsLogs(Command):
         check(len({*self.topics}) == 2, "--topics", "two topics", " ".join(self.topics))
         tables = not self.map or any(map(is_table, paths))
         check(tables, "--map", "a table or a recording of ROS", paths[0])
-        log = logs.join_logs({path: self.read_log(path, machine) for path in paths})
+        each = {path: self.read_log(path, machine) for path in paths}
+        common = set.intersection(*(set(log.joints) for log in each.values()))
+        dropped = {machine.names[i] for i in machine.locked} - common  # some logs have not
+        log = logs.join_logs(
+            {
+                path: logs.only(log, [name for name in log.joints if name not in dropped])
+                for path, log in each.items()
+            }
+        )
         known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
         if machine == BROKK_170 and set(log.joints) != set(known):
             return log, None
@@ -93,7 +101,9 @@ class Inspect(ReadsLogs):
             net, window = load_net(self.net), machine.velocity_samples
             wanted, got = f"velocity_samples {window} of --machine", net.velocity_samples
             require(got == window, str(self.net), wanted, got)
-            scores = validation.score(net, logs.in_order(log, net.joints))
+            others = {*log.joints} - {*net.joints} - {machine.names[i] for i in machine.locked}
+            its = log if others else logs.only(log, [x for x in log.joints if x in net.joints])
+            scores = validation.score(net, logs.in_order(its, net.joints))
             if known and (net.machine, net.rate) == (known.name, known.rate):
                 driven = select_nets(known, net)
                 learned = valve_report.from_log(known, driven, log)
@@ -161,9 +171,9 @@ class Fit(ReadsLogs):
         print(*(f"warning: {one}\n" for one in unscored), sep="", end="", flush=True)
         name = known.name if known else ""
         net = fitting.fit_nets(log, settings, self.seed, machine, name)
+        save_net(self.out, net)
         scores = validation.score(net, test)
         of_scores = [*validation.warnings(scores)]
-        save_net(self.out, net)
         if self.json:
             files = {"logs": list(map(str, self.logs)), "test": list(map(str, self.test))}
             meta = {"machine": name, **files, **net.training}

@@ -16,6 +16,7 @@ from brokk_min._files import require_package
 from brokk_min.actuator import ActuatorNet
 from brokk_min.beyond.adaptation import Adaptive, valves
 from brokk_min.can.connection import open_bus
+from brokk_min.can.drive_log import OTHERS
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
 from brokk_min.can.simulated_machine import parse_fault, run_machine
 from brokk_min.cli.options import (
@@ -28,6 +29,7 @@ from brokk_min.cli.options import (
 )
 from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST, baselines
 from brokk_min.evaluation.rollout import title
+from brokk_min.identification.columns import TABLES
 from brokk_min.identification.valve_report import describe, load_known, save_known
 from brokk_min.learning.policy import load_policy
 from brokk_min.machine import PWM_MAX, Controller, Machine, require
@@ -81,7 +83,10 @@ class DriveMachine(Command):
         nets = self.controller != "jog" or not (self.adapt or self.valves)
         check(nets, "--adapt, --valves", "a controller that has nets", "jog")
         check(self.shadow or not self.sync, "--sync", "--shadow with it", "a drive that sends SYNC")
+        text = self.log is None or self.log.suffix.lower() not in (*TABLES, *OTHERS)
+        check(text, "--log", "a name as run.log: it is candump's text", self.log)
         controller, operator = self.find_controller(machine), self.find_operator(machine)
+        loaded = controller.known if isinstance(controller, Adaptive) else None
         with open_bus(self.interface, self.channel, self.log) as bus:
             if self.shadow:
                 drive: hw.Drive = Shadow(machine, controller, bus, operator, self.sync)
@@ -91,7 +96,8 @@ class DriveMachine(Command):
                 drive.begin()
                 drive.run(show)
             finally:
-                self.keep_valves(machine, controller)
+                if isinstance(controller, Adaptive) and controller.known is not loaded:
+                    self.keep_valves(machine, controller)  # of which it has learned
         if isinstance(drive, Shadow):
             print(drive.report())
         played = not isinstance(operator, Script) or operator.done
@@ -115,12 +121,12 @@ class DriveMachine(Command):
         check(0 < self.counts <= limit, "--counts", f"1 to {limit}", self.counts)
         return JointJog(machine, self.joint, self.counts / PWM_MAX)
 
-    def keep_valves(self, machine: Machine, controller: Controller) -> None:
-        """Print what is known of the valves, and write it to `valves`."""
-        if isinstance(controller, Adaptive) and controller.known:
-            print(*describe(machine, controller.known), sep="\n")
-            if self.valves:
-                save_known(self.valves, machine, controller.net, controller.known)
+    def keep_valves(self, machine: Machine, controller: Adaptive) -> None:
+        """Write what is known of the valves to `valves`, and print it, if somebody reads."""
+        assert controller.known is not None  # it has learned
+        if self.valves:
+            save_known(self.valves, machine, controller.net, controller.known)
+        print(*describe(machine, controller.known), sep="\n")
 
     def find_operator(self, machine: Machine) -> Any:
         """The joystick, or the script of a file; None: a shadow follows the tool."""

@@ -266,6 +266,6 @@ def default_policy(machine: Machine, policy: Path | None) -> tuple[Path, Path | 
 
 def load_pids(machine: Machine, gains: Path, net: ActuatorNet) -> Baselines:
     """The PIDs with the gains of a file for these nets; the package's keep the package's nets."""
-    if gains.parent == SHIPPED / machine.name:
+    if gains.resolve().parent == (SHIPPED / machine.name).resolve():
         net = load_policy(gains.with_name("policy.npz"), machine).net
     return read_gains(gains, machine, net)

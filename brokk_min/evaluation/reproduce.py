@@ -76,8 +76,11 @@ def reproduce(machine: Machine, out: Path, budget: Budget, seed: int) -> dict[st
     """
     chain = Chain(machine, out, budget, seed)
     out.mkdir(parents=True, exist_ok=True)
+    moves = task_starts(chain)  # before hours of work: there may be none
+    _, runs, seconds = budget.tuning
+    sequences.tuning_set(machine, runs, seed, seconds)
     done = learn(chain, record_log(chain, RICH, "log"), record_log(chain, SINE, "log_paper"))
-    results, measured = measure_all(chain, done)
+    results, measured = measure_all(chain, done, *moves)
     write_json(out / "results.json", results)
     keys = ("meta", "table", "pairs", "claims")
     write_json(out / "table.json", {key: results[key] for key in keys})
@@ -151,14 +154,21 @@ def learn(chain: Chain, log: Log, paper_log: Log) -> dict[str, Any]:
     return side_by_side(jobs, needs)
 
 
-def measure_all(chain: Chain, done: Mapping[str, Any]) -> tuple[dict[str, Any], report.Shown]:
+def task_starts(chain: Chain) -> tuple[list[sequences.Commands], Array]:
+    """The scored motions, and the poses [rad] (starts, n) in which they start."""
+    machine, commands = chain.machine, sequences.task_sequences(chain.machine)
+    starts = sequences.draw_starts(machine, chain.budget.starts, commands, chain.seed + 2)
+    write_csv(chain.out / "starts.csv", machine.names, starts.tolist())
+    return commands, starts
+
+
+def measure_all(
+    chain: Chain, done: Mapping[str, Any], commands: list[sequences.Commands], starts: Array
+) -> tuple[dict[str, Any], report.Shown]:
     """All measurements for `results.json`, and what the figures show. `done` is of `learn`."""
     machine, budget, seed = chain.machine, chain.budget, chain.seed
     net = select_nets(machine, done["net"])
     controllers = {name: done[name] for name in POLICIES} | done["pids"]
-    commands = sequences.task_sequences(machine)
-    starts = sequences.draw_starts(machine, budget.starts, commands, seed + 2)
-    write_csv(chain.out / "starts.csv", machine.names, starts.tolist())
     ticks = round(budget.short_s * machine.rate)
     short = [axis._replace(goals=axis.goals[:ticks]) for axis in commands[:3]]
     plants: dict[str, Plant] = {"machine": PLANT, "nets": net}

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from brokk_min._files import SHIPPED, numbers, read_csv
 from brokk_min.actuator import cylinder_speeds, lever_arm
 from brokk_min.env import draw_goal, draw_hold, draw_pose
-from brokk_min.jacobian import dls, limit_weights
+from brokk_min.jacobian import dls, limit_weights, manipulability_threshold
 from brokk_min.kinematics import forward_kinematics, jacobian, lowest_point, tool_position
 from brokk_min.machine import BROKK_170, PWM_MAX, Array, Machine, require, valve_opening
 from brokk_min.settings import TaskConfig
@@ -209,6 +209,7 @@ def first(machine: Machine, num: int, draw: Callable[[], Iterable[Any]]) -> list
     draws = chain.from_iterable(draw() for _ in range(DRAWS))
     found = list(tqdm(islice(draws, num), "draw starts", num, leave=False, disable=None))
     wanted = "from which the arm stays on its path, above the ground and within ranges and speeds"
-    doubt = f"{len(found)}: is tool_speed too large?"
-    require(len(found) == num, machine.name, f"{num} starts {wanted}", doubt)
+    axes = manipulability_threshold(machine) > 1e-6
+    doubt = "is tool_speed too large?" if axes else "its joints do not move the tool along x, y, z"
+    require(len(found) == num, machine.name, f"{num} starts {wanted}", f"{len(found)}: {doubt}")
     return found

@@ -41,6 +41,10 @@ def sweep(
     for file in (*others.values(), "gains.json") if beside else ():
         there = beside is None or (beside / file).exists()
         require(there, f"--robustness {beside}", f"a folder of `reproduce`, with {file}", "none")
+    if beside:  # now, and not after the trainings
+        read_gains(beside / "gains.json", machine, net)
+        for file in others.values():
+            load_policy(beside / file, machine)
     out.mkdir(parents=True, exist_ok=True)
     job = partial(run_seed, machine, net, recipe, out.resolve(), starts)
     done = side_by_side({str(seed): partial(job, seed) for seed in seeds}, None, scheduler)

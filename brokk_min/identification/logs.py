@@ -49,6 +49,11 @@ def without(log: Log, names: Collection[str]) -> Log:
 def in_order(log: Log, joints: Sequence[str]) -> Log:
     """A log whose arrays have the joints in this order. ValueError: it has other joints."""
     require(set(log.joints) == set(joints), "joints", brief(list(joints)), brief(list(log.joints)))
+    return only(log, joints)
+
+
+def only(log: Log, joints: Sequence[str]) -> Log:
+    """A log of some of its joints, in this order."""
     order = [log.joints.index(name) for name in joints]
     recordings = (Recording(one.name, *(x[:, order] for x in one[1:])) for one in log.recordings)
     return log._replace(joints=tuple(joints), recordings=tuple(recordings))

@@ -73,13 +73,15 @@ def train_policy(
     """
     about: dict[str, Any] = {"contract": contract(machine, recipe.interface)}
     about |= {"actuator": fingerprint(net), "seed": seed, "recipe": asdict(recipe)}
+    speeds = [[joint.q_dot_up, joint.q_dot_down] for joint in machine.joints]
+    goals = {"tool_speed": machine.tool_speed, "ground": machine.ground, "speeds": speeds}
     config, checkpoint = recipe.learner, Path(f"{out}.checkpoint")
     env, advantages, start = prepare(machine, net, recipe, seed)
     updates = math.ceil(config.total_steps / (config.num_envs * config.horizon))
     rows: Curve = []
     ours = written(checkpoint)
     if checkpoint.exists() and checkpoint.stat().st_size:
-        start, rows = load(checkpoint, about, env, start)
+        start, rows = load(checkpoint, about | goals, env, start)
 
     def policy_of(agent: Agent) -> Policy:
         training = about | {"made_with": made_with()}
@@ -98,7 +100,7 @@ def train_policy(
         if now.update % EVERY == 0 or now.global_step >= config.total_steps:
             alone = written(checkpoint) in (0, ours)
             require(alone, str(checkpoint), "one training with this name", "another, which goes on")
-            save(checkpoint, about, env, now, rows)
+            save(checkpoint, about | goals, env, now, rows)
             write_csv(Path(f"{out}.csv"), rows[0], [row.values() for row in rows])
             ours = written(checkpoint)
 

@@ -20,6 +20,7 @@ ENVIRON = "distributed.nanny.pre-spawn-environ"  # of the processes that run the
 SETTINGS = {
     f"{ENVIRON}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
     f"{ENVIRON}.MALLOC_MMAP_THRESHOLD_": 2**30,  # glibc adapts it no more then
+    "distributed.scheduler.unknown-task-duration": "1h",  # else idle workers leave long ones alone
     "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
 }
 LOCAL = {"threads_per_worker": 1, "memory_limit": None, "silence_logs": "CRITICAL"}

@@ -1,9 +1,14 @@
 """Ten faults planted in a drive of a policy on its nets: `examples/diagnose.py` names them."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers_bus import random_policy
 
+from brokk_min._files import SHIPPED
 from brokk_min.actuator import append_sample, initial_history
 from brokk_min.can.drive_log import Telemetry
 from brokk_min.env import measure
@@ -12,6 +17,7 @@ from brokk_min.machine import BROKK_170 as M
 from brokk_min.machine import read_encoder
 from examples.diagnose import diagnose
 
+PROGRAM = Path(__file__).parents[2] / "examples" / "diagnose.py"
 START = np.array([[0.0, 0.5, 0.58, 1.71, 1.24]])
 POLICIES = {name: random_policy(name) for name in ("paper", "beyond")}
 
@@ -70,3 +76,13 @@ def test_diagnose__finds_nothing_in_a_sound_drive(name):
 def test_diagnose__names_a_planted_fault(name):
     terms = diagnose(M, POLICIES["paper"], drive(**FAULTS[name]))
     assert any(name in term.name for term in terms[:3]), terms[:6]
+
+
+def test_program__names_a_log_that_tells_nothing_in_one_line(tmp_path):
+    policy = SHIPPED / M.name / "policy.npz"
+    (tmp_path / "empty.log").write_text("")
+    for log, words in (("none.log", "none.log"), ("empty.log", "some of which drive")):
+        command = [sys.executable, PROGRAM, tmp_path / log, policy]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+        assert done.stderr.startswith("diagnose.py: ") and words in done.stderr

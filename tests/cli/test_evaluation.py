@@ -84,8 +84,10 @@ def test_evaluate__takes_a_controller_of_ones_own(folder, capsys):
     told = "finite numbers, got", "an array (1, 5), got (1, 2)", "commands and its state, got"
     told = *told, "0 for joints that are not driven, got", "parts of full command, -1 to 1, got"
     for kind, words in zip(("Nan", "Short", "Alone", "Locked", "Counts"), told, strict=True):
-        assert evaluate(folder, f"--controller {folder}/bad.py:{kind}") == 1
-        assert words in capsys.readouterr().err
+        named = f"--controller {folder}/bad.py:{kind}"
+        assert evaluate(folder, f"{named} --save-gains {folder}/g.json") == 1
+        said = capsys.readouterr().err
+        assert words in said and "tuned now" not in said  # it is tried before
     assert evaluate(folder, f"--controller {folder}/bad.py:Ends") == 1
     assert "expected a controller whose start(num) gives its state" in capsys.readouterr().err
     before = Path.cwd()
@@ -130,10 +132,18 @@ def test_evaluate__takes_the_packages_pids_where_a_policy_has_none(folder, monke
     assert json.loads((folder / "e.json").read_text())["meta"]["gains"] == "tuned now"
 
 
-def test_evaluate__has_policies_and_poses_of_the_package(folder, capsys):
+def test_evaluate__has_policies_and_poses_of_the_package(folder, capsys, monkeypatch):
+    """Also by the names of its files in its folder; and says whether the arm can follow."""
     assert run(f"evaluate --commands {folder}/c.csv --num-starts 3") == 0
-    printed = capsys.readouterr().out
-    assert "means over 1 sequences from 3 starts" in printed
+    printed, said = capsys.readouterr()
+    assert "means over 1 sequences from 3 starts" in printed and "warning" not in said
+    monkeypatch.chdir(SHIPPED)
+    policy = f"{BROKK_170.name}/policy_critic.npz"
+    lines = "".join(f"far,{t},0,0,0.3\n" for t in range(0, 40, 2))
+    (folder / "far.csv").write_text(f"sequence,time,vx,vy,vz\n{lines}")
+    assert run(f"evaluate --policy {policy} --commands {folder}/far.csv --num-starts 3") == 0
+    wanted = "warning: --commands: expected starts from which the arm can follow far (--starts), "
+    assert f"{wanted}got 3 of 3 that leave" in capsys.readouterr().err
     assert all(f"\n{TITLES[name]}" in printed for name in POLICIES)
 
 
@@ -146,6 +156,31 @@ def test_reproduce__does_not_write_over_results(tmp_path, capsys):
     assert run(f"reproduce --quick --out {tmp_path}") == 2
     assert "log.npz: expected no file (or --force), got one that" in capsys.readouterr().err
     assert (tmp_path / "log.npz").read_text() == "{}"
+    (tmp_path / "log.npz").rename(tmp_path / "gains.json")  # of one's own, beside other logs
+    assert run(f"reproduce --quick --out {tmp_path}") == 2
+    assert "gains.json: expected no file (or --force), got one that" in capsys.readouterr().err
+
+
+def test_reproduce__does_not_go_on_from_checkpoints_of_another_chain(tmp_path, capsys, monkeypatch):
+    """Of which it would hear after the fits alone; with --force it begins anew."""
+
+    def stopped(_, out, budget, seed):
+        (out / "policy.npz.checkpoint").write_text("of some hours")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("brokk_min.evaluation.reproduce.reproduce", stopped)
+    checkpoint = tmp_path / "policy.npz.checkpoint"
+    for _ in range(2):  # the same goes on
+        assert run(f"reproduce --quick --out {tmp_path}") == 1
+    capsys.readouterr()
+    for other in ("", "--quick --seed 1"):
+        assert run(f"reproduce {other} --out {tmp_path}") == 2
+        wanted = f"{checkpoint}: expected no file (or --force), got one of a chain with another"
+        assert wanted in capsys.readouterr().err and checkpoint.exists()
+    monkeypatch.setattr("brokk_min.evaluation.reproduce.reproduce", lambda *_: {}["task_space"])
+    with pytest.raises(KeyError):
+        run(f"reproduce --force --out {tmp_path}")
+    assert not checkpoint.exists()
 
 
 def test_evaluate__adapts_each_controller_cold_and_warm(folder, capsys, monkeypatch):

@@ -149,6 +149,31 @@ def test_fit__knows_the_machine_of_a_log_and_the_papers_recipe(tmp_path, capsys)
     assert "n.npz: expected velocity_samples 4 of --machine, got 3" in capsys.readouterr().err
 
 
+def test_logs__some_of_which_have_no_locked_joint_are_one_log(tmp_path, capsys):
+    """As tables of the driven joints beside logs of a bus, which has all."""
+    every, driven = (
+        steady_log(tmp_path / f"{len(names)}.csv", names)
+        for names in (BROKK_170.names, ("q1", "q3", "q4", "q5"))
+    )
+    net = tmp_path / "n.npz"
+    assert run(f"fit {TINY}", driven, every, "--out", net) == 0
+    assert load_net(net).joints == ("q1", "q3", "q4", "q5")
+    assert run("inspect --net", net, every) == 0
+    two = steady_log(tmp_path / "two.csv", ("q1", "q3"))  # of driven ones all must have all
+    assert run(f"fit --force {TINY}", two, every, "--out", net) == 1
+    assert "joints: expected ['q1', 'q3'], got ['q1', 'q3', 'q4', 'q5']" in capsys.readouterr().err
+
+
+def test_fit__keeps_its_nets_if_it_is_stopped_while_it_scores(tmp_path, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("brokk_min.identification.validation.score", stopped)
+    log = steady_log(tmp_path / "log.csv", MIXED)
+    assert run(f"fit {TINY}", log, "--out", tmp_path / "n.npz") == 1
+    assert load_net(tmp_path / "n.npz").joints == BROKK_170.names
+
+
 def test_collect__records_what_read_log_reads(tmp_path):
     logs = []
     for seed in (0, 1):

@@ -4,10 +4,14 @@ import os
 import signal
 import struct
 import threading
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_bus import Virtual
+from helpers_cli import run
 
 from benchmarks.one_process import BASELINE, HoldingOperator, World, only
 from brokk_min.beyond.adaptation import valves
@@ -20,6 +24,8 @@ from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST
 from brokk_min.identification.valve_report import KEPT
 from brokk_min.learning.policy import Policy
 from brokk_min.machine import BROKK_170
+
+RECTANGLE = Path(__file__).parents[2] / "docs" / "rectangle.csv"
 
 
 def test_find_controller__is_the_policy_or_the_pid_with_the_gains_beside_it(folder):
@@ -79,7 +85,9 @@ def test_status__names_the_axis_of_a_stick_that_is_not_centred():
     device.unplug()
 
 
-def test_drive_adapt__learns_on_the_bus_logs_keeps_and_begins_with_what_it_knew(tmp_path, capsys):
+def test_drive_adapt__learns_on_the_bus_logs_keeps_and_begins_with_what_it_knew(
+    tmp_path, capsys, monkeypatch
+):
     kept, log = tmp_path / "valves.json", tmp_path / "run.log"
     command = DriveMachine(interface="virtual", channel="v", adapt=True, valves=kept)
     controller = command.find_controller(BROKK_170)
@@ -100,6 +108,18 @@ def test_drive_adapt__learns_on_the_bus_logs_keeps_and_begins_with_what_it_knew(
     again = command.find_controller(BROKK_170).known
     assert again.seconds.sum() == pytest.approx(KEPT * controller.known.seconds.sum())
     assert again.seconds.sum() > 1.0
+    written = kept.read_bytes()
+    drive = f"drive --interface virtual --channel nobody --command '{RECTANGLE}'"
+    assert run(f"{drive} --adapt --valves {kept}") == 1  # it has learned nothing
+    assert "expected an answer" in capsys.readouterr().err and kept.read_bytes() == written
+    with suppress(OSError), open("/dev/full", "w", buffering=1) as lost:  # a closed terminal
+        monkeypatch.setattr("sys.stdout", lost)
+        with pytest.raises(OSError, match="No space left"):
+            replace(command, valves=tmp_path / "new.json").keep_valves(BROKK_170, controller)
+    monkeypatch.undo()
+    assert (tmp_path / "new.json").read_bytes() == written
+    assert run(f"{drive} --log {tmp_path}/run.csv") == 2
+    assert "--log: expected a name as run.log: it is candump's text" in capsys.readouterr().err
     shadow = DriveMachine(interface="virtual", channel="v", shadow=True)
     assert not shadow.find_controller(BROKK_170).applies
     plain = DriveMachine(interface="virtual", channel="v").find_controller(BROKK_170)

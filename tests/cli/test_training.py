@@ -103,6 +103,10 @@ def test_train__refuses_goals_that_the_machine_cannot_follow(tmp_path, monkeypat
     Path("m.py").write_text(f"{text}FAST = replace(BROKK_170, tool_speed=3.0)\n")
     assert run("train --machine m.py:FAST --actuator missing.npz") == 1
     assert "got 0: is tool_speed too large?" in capsys.readouterr().err
+    two = "(replace(j, driven=j.name in ('q3', 'q4')) for j in BROKK_170.joints)"
+    Path("m.py").write_text(f"{text}TWO = replace(BROKK_170, joints=tuple({two}))\n")
+    assert run("train --machine m.py:TWO --actuator missing.npz") == 1
+    assert "got 0: its joints do not move the tool along x, y, z" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["m.py"]
 
 

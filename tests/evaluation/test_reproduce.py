@@ -139,6 +139,18 @@ def test_reproduce__results_hold_every_run_and_a_verdict_on_each_sentence(folder
     assert len(re.findall(r'src="data:image/png;base64,iVBOR', page)) == 8
 
 
+@pytest.mark.parametrize("name", ["draw_starts", "tuning_set"])
+def test_reproduce__says_that_the_arm_cannot_follow_before_the_work(name, tmp_path, monkeypatch):
+    def few(*_):
+        raise ValueError("expected 2 starts")
+
+    monkeypatch.setattr(sequences, "draw_starts", lambda *_: np.zeros((2, 5)))
+    monkeypatch.setattr(sequences, name, few)
+    monkeypatch.setattr(reproduce, "record_log", pytest.fail)
+    with pytest.raises(ValueError, match="expected 2 starts"):
+        reproduce.reproduce(COARSE, tmp_path, TINY, 0)
+
+
 def test_variations__change_what_they_say():
     result, speeds = variations(BROKK_170), cylinder_speeds(BROKK_170)
     assert len(result) == 8 and result["nominal"] is BROKK_170

@@ -94,7 +94,13 @@ def test_sweep__trains_and_scores_each_seed_once(tmp_path, monkeypatch, capsys):
         sweep.run_seed(BROKK_170, NET, RECIPE, out, 2, 7)
     with pytest.raises(ValueError, match=r"of `reproduce`, with policy_paper\.npz, got none"):
         sweep.sweep(BROKK_170, NET, RECIPE, [8], tmp_path / "new", 2, beside=out)
-    assert not (tmp_path / "new").exists()
+    (out / "policy_paper.npz").write_bytes((beside / "policy_paper.npz").read_bytes())
+    (out / "policy_critic.npz").write_bytes((beside / "policy_critic.npz").read_bytes())
+    (out / "gains.json").write_text((beside / "gains.json").read_text())
+    other_net = small_net(BROKK_170, np.random.default_rng(1))
+    with pytest.raises(ValueError, match=r"gains\.json: actuator: expected"):
+        sweep.sweep(BROKK_170, other_net, RECIPE, [8], tmp_path / "new", 2, beside=out)
+    assert not (tmp_path / "new").exists()  # it was said before the trainings
     (beside / "sweep.json").write_text("of somebody else")
     assert run(f"{command} --out {beside}") == 2
     assert "got one that `sweep` did not write" in capsys.readouterr().err

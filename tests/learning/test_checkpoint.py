@@ -37,8 +37,8 @@ def often(monkeypatch):
     monkeypatch.setattr("brokk_min.learning.checkpoint.EVERY", 2)
 
 
-def run(path, kind="ours", seed=5, net=NET, look=None):
-    return train_policy(BROKK_170, net, RECIPES[kind], seed, path, look)
+def run(path, kind="ours", seed=5, net=NET, look=None, machine=BROKK_170):
+    return train_policy(machine, net, RECIPES[kind], seed, path, look)
 
 
 def run_until_interrupted(path, kind="ours"):
@@ -122,6 +122,9 @@ def test_checkpoint__is_refused_where_it_does_not_belong(tmp_path):
         run(path, seed=6)
     with pytest.raises(ValueError, match="actuator: expected"):
         run(path, net=obedient_net(BROKK_170))
+    faster = replace(BROKK_170, tool_speed=0.5)  # other goals, and another scale of what it sees
+    with pytest.raises(ValueError, match=r"checkpoint: tool_speed: expected 0\.5, got"):
+        run(path, machine=faster)
     checkpoint = tmp_path / "p.npz.checkpoint"
     checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
     with pytest.raises(ValueError, match=rf"^{checkpoint}: expected a readable checkpoint, got "):

@@ -134,6 +134,13 @@ def test_hydraulics__that_cannot_be_are_refused_by_name_before_anything_moves(ch
         replace(BROKK, delay=float("nan"))
 
 
+@pytest.mark.parametrize("rate", [10.0, 15.0, 20.0, 24.0, 30.0, 60.0, 100.0, 1000.0])
+def test_a_machine_without_hydraulics__has_whole_steps_in_a_tick_of_any_rate(rate):
+    dt = actuator.hydraulics_of(replace(BROKK_170, hydraulics=None, rate=rate)).dt
+    assert round(1 / (rate * dt), 6).is_integer() and dt <= 0.005
+    assert dt == 0.005 or rate not in (10, 20, 100)
+
+
 def test_the_brokk__has_the_hydraulics_of_the_design():
     h = actuator.hydraulics_of(BROKK_170)
     assert (h.delay, h.dt, h.tau_spool, h.tau_cylinder) == (0.04, 0.005, 0.03, 0.03)
