@@ -108,7 +108,8 @@ def hydraulics_of(machine: Machine) -> Hydraulics:
     >>> hydraulics_of(BROKK_170).pump_flow
     0.00105
     """
-    plain = Hydraulics(dt=machine.dt / math.ceil(machine.dt / Hydraulics.dt - 1e-6))
+    whole = math.ceil(machine.dt / Hydraulics.dt - 1e-6)  # steps in a tick, of 5 ms at most
+    plain = Hydraulics(dt=machine.dt / whole)
     h = plain if machine.hydraulics is None else machine.hydraulics
     if isinstance(h, str):
         require(h in HYDRAULICS, "hydraulics", f"one of {[*HYDRAULICS]}, or a value", h)

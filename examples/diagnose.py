@@ -51,7 +51,8 @@ def read_ticks(machine: Machine, log: Path) -> list[Telemetry]:
     driving = sum(tick.driving for tick in ticks[first:end])
     least = machine.history + round(2 * AHEAD * machine.rate)
     wanted = f"{least} ticks or more, some of which drive"
-    require(end - first >= least and driving > 1, str(log), wanted, f"{end - first} and {driving}")
+    got = f"{end - first} ticks, of which {driving} drive"
+    require(end - first >= least and driving > 1, str(log), wanted, got)
     return ticks[first:end]
 
 

@@ -64,12 +64,8 @@ class ReadsLogs(Command):
         check(tables, "--map", "a table or a recording of ROS", paths[0])
         each = {path: self.read_log(path, machine) for path in paths}
         common = set.intersection(*(set(log.joints) for log in each.values()))
-        dropped = {machine.names[i] for i in machine.locked} - common  # some logs have not
         log = logs.join_logs(
-            {
-                path: logs.only(log, [name for name in log.joints if name not in dropped])
-                for path, log in each.items()
-            }
+            {path: logs.without_locked(log, machine, common) for path, log in each.items()}
         )
         known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
         if machine == BROKK_170 and set(log.joints) != set(known):
@@ -101,8 +97,7 @@ class Inspect(ReadsLogs):
             net, window = load_net(self.net), machine.velocity_samples
             wanted, got = f"velocity_samples {window} of --machine", net.velocity_samples
             require(got == window, str(self.net), wanted, got)
-            others = {*log.joints} - {*net.joints} - {machine.names[i] for i in machine.locked}
-            its = log if others else logs.only(log, [x for x in log.joints if x in net.joints])
+            its = logs.without_locked(log, machine, net.joints)
             scores = validation.score(net, logs.in_order(its, net.joints))
             if known and (net.machine, net.rate) == (known.name, known.rate):
                 driven = select_nets(known, net)

@@ -59,6 +59,12 @@ def only(log: Log, joints: Sequence[str]) -> Log:
     return log._replace(joints=tuple(joints), recordings=tuple(recordings))
 
 
+def without_locked(log: Log, machine: Machine, kept: Collection[str]) -> Log:
+    """A log without those locked joints of the machine that are not `kept`."""
+    locked = {machine.names[i] for i in machine.locked} - {*kept}
+    return only(log, [name for name in log.joints if name not in locked])
+
+
 def join_logs(logs: Mapping[Path, Log]) -> Log:
     """One log of several files, in the order of the first; ValueError: other joints, or empty.
 

@@ -159,6 +159,9 @@ def test_reproduce__does_not_write_over_results(tmp_path, capsys):
     (tmp_path / "log.npz").rename(tmp_path / "gains.json")  # of one's own, beside other logs
     assert run(f"reproduce --quick --out {tmp_path}") == 2
     assert "gains.json: expected no file (or --force), got one that" in capsys.readouterr().err
+    (tmp_path / "gains.json").rename(tmp_path / "policy.npz.checkpoint")  # of a training
+    assert run(f"reproduce --quick --out {tmp_path}") == 2
+    assert "checkpoint: expected no file (or --force), got one of" in capsys.readouterr().err
 
 
 def test_reproduce__does_not_go_on_from_checkpoints_of_another_chain(tmp_path, capsys, monkeypatch):

@@ -61,24 +61,12 @@ def functions(code: types.CodeType) -> Iterator[types.CodeType]:
             yield from functions(part)
 
 
-@cache
-def right_functions(name: str) -> list[types.CodeType]:
-    """Those of a module of the package as it is."""
-    module = importlib.import_module(f"brokk_min.{name}")
-    return [*functions(compile(inspect.getsource(module), str(module.__file__), "exec"))]
-
-
-@cache
-def caches(names: tuple[str, ...]) -> list[Any]:
-    """Each `lru_cache` of these modules."""
-    things = itertools.chain.from_iterable(vars(sys.modules[name]).values() for name in names)
-    return [thing for thing in things if hasattr(thing, "cache_clear")]
-
-
 def clear_caches() -> None:
     """Empty each `lru_cache` of the package."""
-    for one in caches(tuple(name for name in sys.modules if name.startswith("brokk_min."))):
-        one.cache_clear()
+    for name, module in list(sys.modules.items()):
+        if name.startswith("brokk_min."):
+            for thing in vars(module).values():
+                getattr(thing, "cache_clear", lambda: None)()
 
 
 @contextmanager
@@ -88,9 +76,9 @@ def planted(name: str, right: str, wrong: str) -> Iterator[None]:
     source = inspect.getsource(module)
     if source.count(right) != 1:
         raise ValueError(f"{name}: expected {right!r} once, got {source.count(right)} times")
+    before = functions(compile(source, str(module.__file__), "exec"))
     after = functions(compile(source.replace(right, wrong), str(module.__file__), "exec"))
-    pairs = zip(right_functions(name), after)
-    *_, changed = (new for old, new in pairs if old != new)  # a method after its class
+    *_, changed = (new for old, new in zip(before, after) if old != new)  # a method after its class
     thing = attrgetter(changed.co_qualname)(module)
     function = inspect.unwrap(getattr(thing, "fget", None) or getattr(thing, "func", thing))
     with pytest.MonkeyPatch.context() as patch:
