@@ -113,7 +113,10 @@ def plain_frame(message: Any) -> Frame:
 
 @contextmanager
 def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[Bus]:
-    """A bus by python-can's names, until the end of the block; ValueError: no bus, or it fails."""
+    """A bus by python-can's names, until the end of the block; ValueError: no bus, or it fails.
+
+    A new log replaces an older file if anybody else was heard; if not, the older one comes back.
+    """
     can = require_package("can", "hw")
     can.log.setLevel("ERROR")  # it also warns of a bus that it could not open
     where = f"{interface} {channel}: expected a CAN bus"
@@ -121,7 +124,11 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         raw = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
         raise ValueError(f"{where}, got {brief(error)}") from error
+    log = Path(log) if log else None
+    older = log.with_name(f".{log.name}.{os.getpid()}") if log and log.is_file() else None
     try:
+        if log and older:
+            os.replace(log, older)
         bus = Bus(raw, channel, log, echo=interface == "udp_multicast")
     except OSError:  # the log cannot be written
         raw.shutdown()
@@ -137,6 +144,11 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         if log and not bus.heard:  # a log of our own frames alone would only be in the way
             log.unlink(missing_ok=True)
         raise
+    finally:
+        if older and bus.heard:
+            older.unlink()
+        elif log and older:
+            os.replace(older, log)
 
 
 @contextmanager

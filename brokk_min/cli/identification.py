@@ -138,6 +138,9 @@ class Fit(ReadsLogs):
         check(self.out.suffix == ".npz", "--out", "a name in .npz", self.out)
         self.writes(self.out, self.json)
         log, known = self.read_logs(self.logs, machine)
+        name = known.name if known else ""
+        of = name or "an unknown machine: one a joint, without a valve"
+        print(f"nets of {of}", flush=True)  # now, not after the fit
         every = log
         if self.test:
             with expected(self.test[0], "a log of the same joints"):
@@ -164,7 +167,6 @@ class Fit(ReadsLogs):
             log, test = (log, logs.without(test, resting)) if self.test else logs.split(log)
             unscored = [*validation.unscored(test, machine.history)]
         print(*(f"warning: {one}\n" for one in unscored), sep="", end="", flush=True)
-        name = known.name if known else ""
         net = fitting.fit_nets(log, settings, self.seed, machine, name)
         save_net(self.out, net)
         scores = validation.score(net, test)
@@ -174,7 +176,7 @@ class Fit(ReadsLogs):
             meta = {"machine": name, **files, **net.training}
             told = {"joints": scores, "warnings": of_scores + warnings + unscored}
             write_json(self.json, {"meta": meta} | told)
-        print(f"{self.out}: nets of {name or 'an unknown machine: one a joint, without a valve'}")
+        print(f"{self.out}: nets of {of}")
         print_scores(scores, of_scores)
 
 

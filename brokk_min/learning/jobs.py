@@ -6,6 +6,7 @@ folder that the calls write to, and one thread each, because torch's settings ho
 
 import os
 import sys
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
@@ -20,7 +21,6 @@ ENVIRON = "distributed.nanny.pre-spawn-environ"  # of the processes that run the
 SETTINGS = {
     f"{ENVIRON}.MALLOC_TRIM_THRESHOLD_": 2**30,  # with dask's 64 kB a training takes 1.4 times
     f"{ENVIRON}.MALLOC_MMAP_THRESHOLD_": 2**30,  # glibc adapts it no more then
-    "distributed.scheduler.unknown-task-duration": "1h",  # else idle workers leave long ones alone
     "distributed.admin.large-graph-warning-threshold": "1TB",  # of logs
 }
 LOCAL = {"threads_per_worker": 1, "memory_limit": None, "silence_logs": "CRITICAL"}
@@ -46,20 +46,36 @@ def side_by_side(
     with dask.config.set(SETTINGS), Client(**options) as client:  # type: ignore[no-untyped-call]
         with suppress(TimeoutError):
             client.wait_for_workers(1, timeout=PATIENCE)
-        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        workers = client.scheduler_info(n_workers=-1)["workers"]
         require(len(workers) > 0, str(scheduler), f"a worker within {PATIENCE} s", "none")
-        threads = sorted({worker["nthreads"] for worker in workers} - {1})
+        threads = sorted({worker["nthreads"] for worker in workers.values()} - {1})
         require(not threads, str(scheduler), "workers with --nthreads 1", threads)
         if scheduler is None:
             client.run(_hide_bars)
+        # dask would let a core wait for calls that stand behind a long one on another: so here a
+        # free one gets the next call by name; a cluster gets all at once, as workers come and go
+        free = [*workers] if scheduler is None else [None] * len(calls)
         jobs: dict[str, Any] = {}
-        for name, call in calls.items():
-            results = [jobs[other] for other in (needs or {}).get(name, ())]
-            jobs[name] = client.submit(call, *results, pure=False, priority=-len(jobs))
-        ended = as_completed(jobs.values(), with_results=True)  # type: ignore[no-untyped-call]
-        bar = tqdm(ended, total=len(jobs), unit="job", disable=None)
-        done = {job.key: result for job, result in bar}
-        return {name: done[job.key] for name, job in jobs.items()}
+        done: dict[str, Any] = {}
+        on: dict[str, str | None] = {}  # worker
+        this = uuid.uuid4().hex  # of all that run on the cluster
+        ended = as_completed(with_results=True)  # type: ignore[no-untyped-call]
+        with tqdm(total=len(calls), unit="job", disable=None) as bar:
+            while len(done) < len(calls):
+                for name, call in calls.items():
+                    needed = (needs or {}).get(name, ())
+                    if free and name not in jobs and done.keys() >= {*needed}:
+                        on[name] = free.pop()
+                        results = [jobs[other] for other in needed]
+                        how = {"key": (name, this), "priority": -len(jobs), "workers": on[name]}
+                        how["allow_other_workers"] = scheduler is None  # of a worker that died
+                        jobs[name] = client.submit(call, *results, **how)
+                        ended.add(jobs[name])  # type: ignore[no-untyped-call]
+                job, result = next(ended)
+                done[job.key[0]] = result
+                free.append(on[job.key[0]])
+                bar.update()
+        return {name: done[name] for name in calls}
 
 
 def _hide_bars() -> None:

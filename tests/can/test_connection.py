@@ -71,6 +71,16 @@ def test_open_bus__keeps_its_log_where_the_adapter_fails(tmp_path):
         raise AssertionError("a log in the place of a folder")
 
 
+@pytest.mark.parametrize("heard", (True, False))
+def test_open_bus__replaces_an_older_log_only_if_somebody_was_heard(tmp_path, heard):
+    (log := tmp_path / "run.log").write_text("an hour of driving")
+    with pytest.raises(ValueError, match="no"), open_bus("virtual", "v", log) as bus:
+        bus.heard = heard
+        raise can.CanOperationError("no answer")
+    assert (log.read_text() == "an hour of driving") is not heard
+    assert [*tmp_path.iterdir()] == [log]
+
+
 def test_recv__waits_for_the_descriptor_by_its_own_clock():
     """A frame comes with the byte of a pipe."""
     reader, writer = os.pipe()

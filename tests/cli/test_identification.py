@@ -132,6 +132,8 @@ def test_fit__knows_the_machine_of_a_log_and_the_papers_recipe(tmp_path, capsys)
         (other, "--no-valve", "", False),
     ):
         assert run(f"fit --force {TINY} {options}", log, "--out", out) == 0
+        named = f"nets of {machine or 'an unknown machine'}"  # before the fit, and after it
+        assert capsys.readouterr().out.startswith(named)
         net = load_net(out)
         assert (net.machine, isinstance(net, ValveNet)) == (machine, valve)
         assert net.training["settings"]["rollout"] == (1 if "paper" in options else 8)

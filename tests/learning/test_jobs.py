@@ -26,6 +26,21 @@ def test_side_by_side__calls_get_what_they_need_and_return_by_name():
     assert list(done) == list(calls) and b != os.getpid()
 
 
+def span(seconds, *results):
+    began = time.monotonic()
+    time.sleep(seconds)
+    return began, time.monotonic()
+
+
+def test_side_by_side__a_free_core_takes_the_next_call(monkeypatch):
+    """No call is queued behind a long one while another core has shorter ones."""
+    monkeypatch.setattr(jobs, "cpu_count", lambda: 2)
+    seconds = {"first": 0.1, "long": 1.5, "short": 0.5, "second": 0.3, "third": 0.3}
+    calls = {name: partial(span, time) for name, time in seconds.items()}
+    done = side_by_side(calls, {name: ["first"] for name in calls if name != "first"})
+    assert done["second"][0] < done["third"][0] and done["third"][1] < done["long"][1]
+
+
 def test_side_by_side__raises_what_a_call_raises():
     with pytest.raises(ValueError, match="invalid literal for int"):
         side_by_side({"a": os.getpid, "b": partial(int, "x")})
