@@ -23,8 +23,6 @@ End: terminated, without reward, if the episode starts with a link in the ground
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

@@ -8,8 +8,6 @@ brokk_min.ppo` trains an agent on a task of Gymnasium. Names follow CleanRL's wh
 target_kl steers the learning rate. Paper: Sec. 3.4
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple

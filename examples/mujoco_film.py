@@ -26,8 +26,7 @@ from matplotlib import get_data_path
 
 from brokk_min._files import SHIPPED
 from brokk_min.can.operator_input import read_commands
-from brokk_min.cli.options import load_pids
-from brokk_min.evaluation.baselines import BY_HAND
+from brokk_min.evaluation.baselines import BY_HAND, load_pids
 from brokk_min.evaluation.rollout import Trace, rollout, title
 from brokk_min.kinematics import forward_kinematics, tool_position
 from brokk_min.learning.policy import load_policy

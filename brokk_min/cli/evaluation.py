@@ -9,14 +9,7 @@ from pathlib import Path
 from brokk_min._files import require_package, whole_file, write_json
 from brokk_min.actuator import ActuatorNet, Plant
 from brokk_min.can.operator_input import read_commands
-from brokk_min.cli.options import (
-    Command,
-    check,
-    default_policy,
-    find_plant,
-    load_pids,
-    own_controller,
-)
+from brokk_min.cli.options import Command, check, default_policy, find_plant, own_controller
 from brokk_min.evaluation import adaptive, baselines, metrics, sequences
 from brokk_min.evaluation.rollout import title, valves_at_rest
 from brokk_min.jacobian import JacobianController
@@ -95,7 +88,7 @@ class Evaluate(Command):
         """The baselines with the gains of a file, or with gains that are tuned now."""
         print(f"gains of the baselines: {path or 'tuned now, for minutes'}", file=sys.stderr)
         if path:
-            return load_pids(machine, path, net)
+            return baselines.load_pids(machine, path, net)
         tuned = baselines.tuned_baselines(machine, net, baselines.EFFORT, self.seed, plant)
         if self.save_gains:
             meta = metrics.metadata(machine, self.seed) | baselines.gains_metadata(machine, net)

@@ -153,11 +153,7 @@ class Fit(ReadsLogs):
             log = every._replace(recordings=every.recordings[:fitted])
             test = every._replace(recordings=every.recordings[fitted:])
         reports = inspection.inspect(every, known)
-        for wrong in (
-            *advice.mixed_units(every),
-            *advice.mixed_up(reports),
-            *advice.wrong_signs(reports),
-        ):
+        for wrong in advice.refusals(every, reports):
             raise ValueError(f"{self.logs[0] if len(self.logs) == 1 else 'LOGS'}: {wrong}")
         warnings, resting = [*advice.warnings(every, reports, known)], advice.resting(reports)
         print(*(f"warning: {one}\n" for one in warnings), sep="", end="", flush=True)

@@ -19,15 +19,8 @@ from brokk_min.can.connection import open_bus
 from brokk_min.can.drive_log import OTHERS
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
 from brokk_min.can.simulated_machine import parse_fault, run_machine
-from brokk_min.cli.options import (
-    Command,
-    check,
-    default_policy,
-    find_plant,
-    load_pids,
-    own_controller,
-)
-from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST, baselines
+from brokk_min.cli.options import Command, check, default_policy, find_plant, own_controller
+from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST, baselines, load_pids
 from brokk_min.evaluation.rollout import title
 from brokk_min.identification.columns import TABLES
 from brokk_min.identification.valve_report import describe, load_known, save_known

@@ -17,9 +17,7 @@ import tyro
 
 from brokk_min._files import NEW, SHIPPED, brief, expected
 from brokk_min.actuator import PLANT, ActuatorNet, Plant, stands_in
-from brokk_min.evaluation.baselines import Baselines, read_gains
 from brokk_min.identification.net_file import load_net
-from brokk_min.learning.policy import load_policy
 from brokk_min.machine import BROKK_170, PWM_MAX, Array, Controller, Machine, Measured, require
 
 LONGEST = 100  # m: no link is so long, but in millimetres most are
@@ -262,10 +260,3 @@ def default_policy(machine: Machine, policy: Path | None) -> tuple[Path, Path | 
     folders = [path.parent, shipped] if machine == BROKK_170 else [path.parent]
     found = [folder / "gains.json" for folder in folders if (folder / "gains.json").exists()]
     return path, found[0] if found else None
-
-
-def load_pids(machine: Machine, gains: Path, net: ActuatorNet) -> Baselines:
-    """The PIDs with the gains of a file for these nets; the package's keep the package's nets."""
-    if gains.resolve().parent == (SHIPPED / machine.name).resolve():
-        net = load_policy(gains.with_name("policy.npz"), machine).net
-    return read_gains(gains, machine, net)

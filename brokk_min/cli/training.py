@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes
 from brokk_min._files import SHIPPED, require_package
 from brokk_min.actuator import ActuatorNet
 from brokk_min.cli.evaluation import table
-from brokk_min.cli.options import Command, check, check_settings, load_pids
+from brokk_min.cli.options import Command, check, check_settings
 from brokk_min.evaluation import baselines, metrics, sequences
 from brokk_min.identification.net_file import load_net
 from brokk_min.learning.policy import load_policy
@@ -100,7 +100,7 @@ class Train(Training):
         try:
             net, look = self.find_net(machine), None
             if machine == BROKK_170:  # the package has PIDs of it
-                pids = load_pids(machine, SHIPPED / machine.name / "gains.json", net)
+                pids = baselines.load_pids(machine, SHIPPED / machine.name / "gains.json", net)
                 look = baselines.beside_pids(machine, pids)
             policy = train_policy(machine, net, recipe, self.seed, self.out, look)
         finally:

@@ -16,10 +16,7 @@ SEED = 7000  # of their motions, which nothing else draws
 
 
 def warm_up_motions(machine: Machine, seconds: float = SECONDS) -> list[tuple[Array, Array]]:
-    """Starts [rad] and goals [m/s] of the parts of a minute, as those that tune the PIDs.
-
-    Or of shorter parts, of so many `seconds`.
-    """
+    """Starts [rad] and goals [m/s] of parts of so many `seconds`, as those that tune the PIDs."""
     return [tuning_set(machine, DRIVES, SEED + part, seconds) for part in range(PARTS)]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from brokk_min import jacobian
-from brokk_min._files import constants, expect_same, expected, write_json
+from brokk_min._files import SHIPPED, constants, expect_same, expected, write_json
 from brokk_min.actuator import PLANT, ActuatorNet, Plant
 from brokk_min.beyond import interface, strong_pid
 from brokk_min.beyond.strong_pid import StrongGains, StrongPID, static_map
@@ -19,6 +19,7 @@ from brokk_min.evaluation.rollout import rollout
 from brokk_min.evaluation.sequences import tuning_set
 from brokk_min.identification.net_file import fingerprint, select_nets
 from brokk_min.jacobian import Gains, JacobianController, manipulability_threshold
+from brokk_min.learning.policy import load_policy
 from brokk_min.machine import Array, Controller, Machine, is_row, require
 from brokk_min.settings import TaskConfig
 
@@ -245,3 +246,10 @@ def read_gains(path: Path, machine: Machine, net: ActuatorNet) -> Baselines:
                 fits = is_row(values, numbers) and min(values) >= 0
                 require(fits, f"{path}: {name}: {key}", f"{numbers} numbers from 0 on", values)
         return baselines(machine, net, gains)
+
+
+def load_pids(machine: Machine, gains: Path, net: ActuatorNet) -> Baselines:
+    """The PIDs with the gains of a file for these nets; the package's keep the package's nets."""
+    if gains.resolve().parent == (SHIPPED / machine.name).resolve():
+        net = load_policy(gains.with_name("policy.npz"), machine).net
+    return read_gains(gains, machine, net)

@@ -12,15 +12,8 @@ from brokk_min._files import digest, write_csv, write_json
 from brokk_min.actuator import PLANT, ActuatorNet, Plant, hydraulics_of
 from brokk_min.beyond.net_ensemble import together
 from brokk_min.beyond.rich_excitation import RICH
-from brokk_min.evaluation import (
-    adaptive,
-    baselines,
-    claims,
-    metrics,
-    preliminary,
-    report,
-    sequences,
-)
+from brokk_min.evaluation import adaptive, baselines, metrics, preliminary, report, sequences
+from brokk_min.evaluation.claims import net_claims, task_claims
 from brokk_min.evaluation.rollout import title
 from brokk_min.fit import SINE, Excitation, Log, collect
 from brokk_min.identification import fitting, logs
@@ -188,7 +181,7 @@ def measure_all(
         "table": {name: of["all"] for name, of in along.items()},
         "task_space": {"runs": runs, "means": metrics.means(runs)},
         "pairs": compare_pairs(runs),
-        "claims": claims.net_claims(tests["nets"], gap) + claims.task_claims(runs),
+        "claims": net_claims(tests["nets"], gap) + task_claims(runs),
         "trainings": trainings(budget, runs),
         "robustness": mean_errors({case: driven[case] for case in varied}),
         "starts": starts.tolist(),

@@ -65,11 +65,13 @@ def another(name: str, r: JointReport) -> Check:
     return r.other, name, f"motion by u_{name}", f"motion by u_{r.other}: are columns mixed up?"
 
 
-def mixed_up(reports: Mapping[str, JointReport]) -> Iterator[str]:
-    """Joints that move by the commands of another one, in words."""
+def refusals(log: Log, reports: Mapping[str, JointReport]) -> Iterator[str]:
+    """What nets must not learn: angles in two units, columns mixed up, wrong signs; in words."""
+    yield from mixed_units(log).values()
     for name, r in reports.items():
         if r.other:
             yield "{1}: expected {2}, got {3}".format(*another(name, r))
+    yield from wrong_signs(reports)
 
 
 def causes(name: str, r: JointReport) -> Iterator[Check]:

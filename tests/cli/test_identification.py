@@ -75,6 +75,15 @@ def test_fit__refuses_reversed_commands_and_inspect_tells_them(tmp_path, capsys)
     (tmp_path / "swapped.csv").write_text(f"{swapped}\n{rows}")
     assert run(f"fit {TINY}", tmp_path / "swapped.csv", "--out", tmp_path / "n.npz") == 1
     assert "expected motion by u_arm, got motion by u_boom" in capsys.readouterr().err
+    slow = read_log(log, BROKK_170)
+    turned = [
+        one._replace(q=one.q * of, q_dot=one.q_dot * of)
+        for one, of in zip(slow.recordings, (0.2, 0.2 * 57.3))
+    ]
+    write_log(tmp_path / "degrees.csv", slow._replace(recordings=tuple(turned)))
+    assert run(f"fit {TINY}", tmp_path / "degrees.csv", "--out", tmp_path / "n.npz") == 1
+    wanted = "degrees.csv: q_boom: expected one unit in all recordings, got larger angles in"
+    assert wanted in capsys.readouterr().err
     short = tmp_path / "short.csv"
     short.write_text("".join(f"{line}\n" for line in table.splitlines()[:10]))
     files = [tmp_path / "sound.csv", "--test", short, "--out", tmp_path / "n.npz"]
