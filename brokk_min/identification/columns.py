@@ -66,7 +66,7 @@ def load_table(
     if path.suffix.lower() == ".npz":
         with open_npz(path) as archive:  # only what is wanted is read
             return find_columns(path, archive, mapped), []
-    table, warnings = read_ros(path, *topics)
+    table, warnings = read_ros(path, *topics, renamed=bool(mapped))
     return find_columns(path, table, mapped), warnings
 
 

@@ -7,12 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import maximum_filter1d
 from tqdm import tqdm
 
 from brokk_min.fit import COMMANDED, MOVED, Log, Recording, Samples, join_recordings, moving
 from brokk_min.identification.joint_model import (
     LATEST,
     OPENS,
+    TELLING,
     ZONES,
     Model,
     Motion,
@@ -32,6 +34,7 @@ from brokk_min.machine import Array, Machine
 
 # Bounds, all assumed.
 AGAINST = 0.4  # least correlation with the other sign of what is expected
+PAUSE = 20.0  # s, of a longer one the middle is no driving
 CLEAR_SIGN = 0.1  # least correlation that has a clear sign
 OPPOSITE = 0.2  # the same of one recording; of sound ones of ours down to -0.11
 FASTEST = 0.999  # quantile of the speeds, because the single ones have noise
@@ -56,7 +59,7 @@ FOLLOWS = 0.8  # of a joint's motion without commands, that another joint explai
 class JointReport(NamedTuple):
     """One joint of a log; pairs are up and down."""
 
-    minutes: float  # in recordings in which it has commands
+    minutes: float  # in which it has commands, with pauses of some seconds
     low: float  # rad, smallest angle
     high: float  # rad
     fastest: Pair  # rad/s, of the velocities in the log
@@ -117,7 +120,11 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         if i != j and model.explained < LEAST_EXPLAINED
     }
     other = max(by, key=lambda name: by[name], default="")
-    driven = sum(len(one.u) for one in recordings if np.ptp(one.u[:, j]) > COMMANDED)
+    driven = sum(
+        (maximum_filter1d(np.abs(one.u[:, j]), round(PAUSE * rate)) > COMMANDED).sum()
+        for one in recordings
+        if np.ptp(one.u[:, j]) > COMMANDED
+    )
     strong = LEAST_MOTION * np.abs(motion.velocity).max()
     parts = ((one, motion_of([one], j, rate, span)) for one in kept)
     alone = [
@@ -131,7 +138,8 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
         high=q.max(),
         fastest=(np.quantile(q_dot, FASTEST), np.quantile(-q_dot, FASTEST)),
         largest=(second.max(), -second.min()),
-        sign=sign(np.concatenate([one.u[:, j] for one in kept]), q_dot, rate),
+        sign=sign(np.concatenate([one.u[:, j] for one in kept]), q_dot, rate)
+        * (model.explained > TELLING),
         explained=model.explained,
         coarse=explained_part(*coarse),
         delay=model.lag[0] / rate,

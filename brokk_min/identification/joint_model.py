@@ -29,6 +29,7 @@ MOVES_STOP = 0.25  # of it, by which a stop may be elsewhere in a recording, as 
 PAUSE = 2.0  # s, after so long a joint without commands is at rest
 OPENS = 0.3  # of full command: it opens any valve
 STARTS = 1.0  # s at the beginning of one that begins in motion, which do not count
+TELLING = 0.3  # of a motion that is explained; less tells neither its sign nor its clock, assumed
 EARLIER = 0.02  # more of a motion is explained if it begins before its commands
 
 Pair = tuple[float, float]  # up and down, or low and high
@@ -122,7 +123,8 @@ def earlier(motion: Motion, model: Model) -> float:
     leads = [motion._replace(u=np.append(motion.u[i:], np.zeros(i))) for i in ahead]
     parts = [best_lag(lead, model.zones).explained for lead in leads]
     best = int(np.argmax(parts))
-    return ahead[best] / motion.rate if parts[best] > model.explained + EARLIER else 0.0
+    better = parts[best] > max(model.explained + EARLIER, TELLING)
+    return ahead[best] / motion.rate if better else 0.0
 
 
 def with_gains(motion: Motion, lag: tuple[int, float], zones: Array, x: Array) -> Model:

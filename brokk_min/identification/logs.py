@@ -32,7 +32,7 @@ def split(log: Log) -> tuple[Log, Log]:
     """
     keys = [moving(recording).tobytes() for recording in log.recordings]
     scored = [keys.count(key) > 1 and keys[:i].count(key) % 10 == 0 for i, key in enumerate(keys)]
-    wanted = "two or more (column run) that drive the same joints, or --test"
+    wanted = "two or more (column run, or files) that drive the same joints, or --test"
     require(any(scored), "recordings", wanted, len(log.recordings))
     fitted = compress(log.recordings, np.logical_not(scored))
     tested = compress(log.recordings, scored)

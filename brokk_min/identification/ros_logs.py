@@ -26,7 +26,9 @@ OLD = 0.5  # s, and five usual periods, assumed: no machine waits so long for a 
 Values = list[tuple[float, dict[str, float]]]  # of joints by their names, each with its stamp [s]
 
 
-def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], list[str]]:
+def read_ros(
+    path: Path, angles: str, commands: str, renamed: bool = False
+) -> tuple[dict[str, Any], list[str]]:
     """Columns `time,q_<joint>...` and `time of commands,u_<joint>...` of two topics; and warnings.
 
     Both in ROS's units. ValueError: no rosbags, no recording, no such topic or another type of
@@ -61,7 +63,7 @@ def read_ros(path: Path, angles: str, commands: str) -> tuple[dict[str, Any], li
         q = [(t, joints_of(state, names, FIELDS[:1])) for t, state in zip(times, states)]
         used = [x for x in FIELDS if any(np.any(getattr(order, x, 0)) for order in orders)]
         u = [(t, joints_of(order, names, used or FIELDS)) for t, order in zip(u_times, orders)]
-        table = columns_of(q, u)
+        table = columns_of(q, u, renamed)
     several = hasattr(orders[0], "data") and any([*state.name] != names for state in states)
     order = [f"{commands}: expected one order of the joints, took {names}"] if several else []
     return table, [*q_warnings, *u_warnings, *order, *old_commands(commands, table)]
@@ -105,25 +107,29 @@ def joints_of(message: Any, names: list[str], fields: Sequence[str]) -> dict[str
     return dict(zip(message.name, filled[0], strict=True)) if filled else {}
 
 
-def columns_of(q: Values, u: Values) -> dict[str, Any]:
+def columns_of(q: Values, u: Values, renamed: bool) -> dict[str, Any]:
     """The columns of `read_ros`: angles from the first complete command on, and all commands.
 
     A row has the stamp of the joint with the fewest angles; those of other nodes are interpolated.
+    Joints without commands are left out, unless joints are `renamed` that have other commands.
     """
     joints = [*dict.fromkeys(name for _, row in u for name in row)]
     angles, commands = ({name: series(rows, name) for name in joints} for rows in (q, u))
     known = [name for name, (times, _) in angles.items() if len(times)]
-    require(bool(joints) and known == joints, "angles", f"those of {joints} (--topics)", known)
+    if known != joints or not joints:
+        others = [*dict.fromkeys(name for _, row in q for name in row)]
+        wanted = f"those of {joints} (--topics, or names by --map q_NAME=q_OTHER)"
+        require(bool(joints) and renamed, "angles", wanted, brief(others))
+        angles = {name: series(q, name) for name in others}
     start = max(times[0] for times, _ in commands.values())
     time = min((times for times, _ in angles.values()), key=len)
     u_time = np.array([t for t, _ in u])
     time, u_time = time[time >= start], u_time[u_time >= start]
     require(len(time) > 0, "angles", "some after the first command", "none")
     table: dict[str, Any] = {"time": time, COMMAND_TIME: u_time}
-    for name in joints:
-        times, values = commands[name]
+    for name, (times, values) in commands.items():
         table[f"u_{name}"] = values[np.searchsorted(times, u_time, side="right") - 1]
-        table[f"q_{name}"] = np.interp(time, *angles[name])
+    table |= {f"q_{name}": np.interp(time, *values) for name, values in angles.items()}
     return table
 
 

@@ -31,7 +31,9 @@ def film(path: Path, machine: Machine, out: Path) -> None:
 def scenes(machine: Machine, path: Path) -> list[Scene]:
     """The ticks of a log from the first driven one on."""
     ticks = list(dropwhile(lambda t: not t.driving, read_telemetry(machine, read_frames(path))))
-    require(len(ticks) > 0, str(path), "a log in which the machine is driven", "another one")
+    require(
+        len(ticks) > 0, str(path), "a log in which the machine is driven", "another (--machine?)"
+    )
     q = np.array([t.q for t in ticks])
     fk = forward_kinematics(machine, q)
     q_dot = velocity_of(q, machine.velocity_samples, machine.rate)

@@ -210,9 +210,15 @@ def test_inspect__reads_drives_and_tables_together(tmp_path, capsys):
 
 def test_inspect__reads_recordings_of_ros(tmp_path, capsys):
     pytest.importorskip("rosbags")
-    from helpers_ros import drive, multi_array, record
+    from helpers_ros import drive, joint_state, multi_array, record
 
     bag = record(tmp_path / "bag", drive(lambda k: multi_array([k / 20, 0.0, -k / 40])))
     assert run("inspect --topics /valves /valves", bag) == 2
     assert run("inspect --topics /joint_states /valves --map arm=q_arm:-1", bag) == 0
     assert re.search(r'Joint\("arm", q_min=-?0.000, q_max=0.380', capsys.readouterr().out)
+    bag = record(tmp_path / "lift", drive(lambda k: joint_state(["lift"], [k / 20])))
+    assert run("inspect --topics /joint_states /valves", bag) == 1
+    named = "those of ['lift'] (--topics, or names by --map q_NAME=q_OTHER), got ['boom', 'wheel'"
+    assert named in capsys.readouterr().err
+    assert run("inspect --topics /joint_states /valves --map q_lift=q_boom", bag) == 0
+    assert re.search(r'Joint\("lift", q_min=-?0.000, q_max=0.190', capsys.readouterr().out)

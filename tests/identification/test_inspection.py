@@ -71,6 +71,27 @@ def test_inspect__finds_what_is_true(name):
     assert (report.low, report.high) == pytest.approx((angles.min(), angles.max()))
 
 
+def test_inspect__counts_minutes_in_which_a_joint_is_driven():
+    """One recording: a joint after the other, 200 s of each."""
+    one = record("boom", np.concatenate([holds(), 0 * holds()]))
+    other = record("arm", np.concatenate([0 * holds(), holds()]))
+    both = one._replace(**{x: getattr(one, x) + getattr(other, x) for x in ("u", "q", "q_dot")})
+    for report in inspect(log_of(both)).values():
+        assert report.minutes == pytest.approx((200 + 10) / 60, abs=0.01)
+
+
+def test_warnings__blame_neither_sign_nor_clock_where_little_is_explained():
+    """Most of the motion is another one; a part follows reversed commands."""
+    one = record("boom", holds())
+    q_dot = -0.1 * one.u[:, 0] + np.random.default_rng(0).normal(0, 0.1, len(one.u))
+    one.q[:, 0] = np.cumsum(q_dot) / 20
+    log = log_of(one._replace(q_dot=velocity_of(one.q, 4)))
+    report = inspect(log)["boom"]
+    told = " ".join(warnings(log, {"boom": report}, None))
+    assert 0.05 < report.explained < 0.3 and report.sign == 0
+    assert "to raise" not in told and "before" not in told
+
+
 def test_inspect__has_the_fastest_motions_of_the_log():
     """Gains of 0.5 and 0.3 from dead zones of 0.12 and 0.2 on; commands of 0.6 held for 3 s."""
     held = np.tile(np.repeat([0.6, 0.0, -0.6, 0.0], 60), 16)
