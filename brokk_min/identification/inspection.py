@@ -44,7 +44,7 @@ RESTS = 0.1  # of the expected motion: less is rest
 STILL = 1.5  # s of clear commands without motion; in sound logs of ours up to 1.15, and
 USUALLY, SOUND = 4.0, 0.6  # so many times the quantile of the log's, of sound ones up to 3.1
 SEVERAL = 5  # recordings tell what is usual
-AT_LEAST = (0.9, 0.3)  # s, if less or more of the motion is explained than
+AT_LEAST = (0.9, 0.45)  # s, if less or more of the motion is explained than
 WELL = 0.9  # as without noise, without coarse steps, and where valves open at once
 SHORTEST = 5.0  # s, of a recording whose sign is looked at
 RESTING, LONG = 0.1, 10.0  # of the samples, and s, in which a joint must rest to tell its command
@@ -272,7 +272,9 @@ def still_seconds(motion: Motion, model: Model, others: Motion) -> float:
     long = (expected > clear).sum() > AT_LEAST[1] * motion.rate
     if long and np.std(motion.velocity) < RESTS * np.std(signed):
         return np.inf  # it may sag, but does not answer
-    ends = reach(motion) < RESTS * clear  # of a second at rest
+    # ends of a second at rest in which it should go somewhere: short pulses open no valve
+    should = reach(motion._replace(velocity=signed * motion.counts)) > clear / 2
+    ends = should & (reach(motion) < RESTS * clear)
     rests = np.convolve(ends, np.ones(round(motion.rate)))[-len(ends) :] > 0
     seconds = np.bincount(np.cumsum(~rests), rests & (expected > clear)) / motion.rate
     return float(seconds.max())

@@ -349,6 +349,12 @@ def test_inspect__does_not_name_a_recording_for_its_last_samples():
     assert inspect(log)["boom"].still == []
 
 
+def test_inspect__does_not_take_short_pulses_for_a_stall():
+    """The valves of this machine open late: three pulses of 0.2 s, 3 s apart, do not move it."""
+    log = collect(BROKK_170, 0.02, np.random.default_rng(4), PLANT, RICH)
+    assert [report.still for report in inspect(log).values()] == 5 * [[]]
+
+
 def test_inspect__names_short_stalls_and_a_joint_that_sags():
     """Neither is taken for a wrong sign, nor is a joint that rests, whose velocity is rounding."""
 
