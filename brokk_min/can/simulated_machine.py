@@ -247,8 +247,9 @@ def run_machine(
     """Run a simulated machine on a bus until a signal; it says why its valve controller stops."""
     gc.freeze()  # no long garbage collection while the encoders should answer
     with open_bus(interface, channel) as bus, stop_signals() as signals:
+        simulated = FaultyMachine(machine, start_pose(machine), bus.now(), plant, faults)
         print(f"{machine.name} on {interface} {channel}; Ctrl-C ends it", flush=True)
-        serve(FaultyMachine(machine, start_pose(machine), bus.now(), plant, faults), bus, signals)
+        serve(simulated, bus, signals)
 
 
 def serve(simulated: SimulatedMachine, bus: Bus, ended: Sequence[object]) -> None:

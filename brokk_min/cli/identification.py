@@ -15,7 +15,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 from brokk_min._files import brief, expected, require_package, write_json
 from brokk_min.beyond.rich_excitation import RICH
 from brokk_min.can.drive_log import log_for_fit, read_frames, timing
-from brokk_min.cli.options import Command, check, check_settings, find_plant
+from brokk_min.cli.options import Command, as_wrong_use, check, check_settings, find_plant
 from brokk_min.fit import SINE, Log, collect
 from brokk_min.identification import columns, logs
 from brokk_min.identification.fitting import PAPER_RECIPE, OurFitConfig
@@ -62,7 +62,9 @@ class ReadsLogs(Command):
         check(len({*self.topics}) == 2, "--topics", "two topics", " ".join(self.topics))
         tables = not self.map or any(map(is_table, paths))
         check(tables, "--map", "a table or a recording of ROS", paths[0])
-        each = {path: self.read_log(path, machine) for path in paths}
+        with as_wrong_use():
+            mapped = columns.parse_map(self.map)
+        each = {path: self.read_log(path, machine, mapped) for path in paths}
         common = set.intersection(*(set(log.joints) for log in each.values()))
         log = logs.join_logs(
             {path: logs.without_locked(log, machine, common) for path, log in each.items()}
@@ -70,12 +72,18 @@ class ReadsLogs(Command):
         known = [j.name for j in machine.joints if j.driven or j.name in log.joints]
         if machine == BROKK_170 and set(log.joints) != set(known):
             return log, None
-        return logs.in_order(log, known), machine
+        others = [name for name in log.joints if name not in machine.names]
+        if others and {*known} <= {*log.joints}:
+            told = f"{paths[0]}: joints: expected those of --machine, left out {brief(others)}"
+            log = log._replace(warnings=(*log.warnings, told))
+            return logs.only(log, known), machine
+        with expected(paths[0], "a log"):
+            return logs.in_order(log, known), machine
 
-    def read_log(self, path: Path, machine: Machine) -> Log:
+    def read_log(self, path: Path, machine: Machine, mapped: columns.Mapped) -> Log:
         """A table or a recording of ROS, else a log of a CAN bus, which needs no `map`."""
         if is_table(path):
-            return logs.read_log(path, machine, columns.parse_map(self.map), self.topics)
+            return logs.read_log(path, machine, mapped, self.topics)
         with expected(path, "a log"):
             log = log_for_fit(machine, read_frames(path))
             return log._replace(warnings=tuple(f"{path}: {one}" for one in log.warnings))

@@ -19,7 +19,14 @@ from brokk_min.can.connection import open_bus
 from brokk_min.can.drive_log import OTHERS
 from brokk_min.can.operator_input import JointJog, Joystick, Script, read_commands
 from brokk_min.can.simulated_machine import parse_fault, run_machine
-from brokk_min.cli.options import Command, check, default_policy, find_plant, own_controller
+from brokk_min.cli.options import (
+    Command,
+    as_wrong_use,
+    check,
+    default_policy,
+    find_plant,
+    own_controller,
+)
 from brokk_min.evaluation.baselines import OPTIMISED, STRONGEST, baselines, load_pids
 from brokk_min.evaluation.rollout import title
 from brokk_min.identification.columns import TABLES
@@ -41,7 +48,8 @@ class Simulate(Command):
     fault: tuple[str, ...] = ()  # [JOINT:]KIND@SECONDS, as q3:stuck@5 ok@8; see docs/hardware.md.
 
     def __call__(self, machine: Machine) -> None:
-        faults = [fault for text in self.fault for fault in parse_fault(machine, text)]
+        with as_wrong_use():
+            faults = [fault for text in self.fault for fault in parse_fault(machine, text)]
         plant = find_plant(self.plant, machine)
         run_machine(machine, self.interface, self.channel, plant, faults)
 
@@ -81,6 +89,7 @@ class DriveMachine(Command):
         controller, operator = self.find_controller(machine), self.find_operator(machine)
         loaded = controller.known if isinstance(controller, Adaptive) else None
         with open_bus(self.interface, self.channel, self.log) as bus:
+            print(f"{machine.name} (--machine) on {self.interface} {self.channel}", flush=True)
             if self.shadow:
                 drive: hw.Drive = Shadow(machine, controller, bus, operator, self.sync)
             else:
@@ -222,7 +231,8 @@ class Export(Command):
     out: Path  # File to write, .onnx.
 
     def __call__(self, machine: Machine) -> None:
-        require_package("onnxscript", "export")
+        for package in ("onnxscript", "torch"):
+            require_package(package, "export")
         from brokk_min.learning.onnx import export_onnx
 
         self.writes(self.out)

@@ -118,6 +118,15 @@ class Command:
             (NEW.discard if self.force else NEW.add)(target)
 
 
+@contextmanager
+def as_wrong_use() -> Iterator[None]:
+    """Turn a ValueError of reading an option into WrongUse."""
+    try:
+        yield
+    except ValueError as error:
+        raise WrongUse(str(error)) from error
+
+
 def load_object(option: str, name: str) -> Any:
     """The object NAME of `FILE.py:NAME`; the file is run, as `python FILE.py` would."""
     path, _, symbol = name.rpartition(":")

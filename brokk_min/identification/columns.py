@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_min._files import brief, numbers, open_npz, read_csv
+from brokk_min._files import brief, expected, numbers, open_npz, read_csv
 from brokk_min.identification.ros_logs import COMMAND_TIME, read_ros
 from brokk_min.machine import Array, require
 
@@ -29,7 +29,8 @@ COMMAND_UNITS = {
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # beside folders of ROS
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
-LARGEST = 1e12  # of numbers in a log, assumed: any time, angle or velocity
+LARGEST = 1e12  # of numbers in a log, assumed: any angle or velocity
+LATEST = 1e20  # of time, which may be nanoseconds since 1970
 Mapped = dict[str, tuple[str, float]]  # column of the log: that of the file, and its factor
 
 
@@ -64,7 +65,8 @@ def load_table(
     if path.suffix.lower() == ".csv":
         return find_columns(path, read_csv(path), mapped), []
     if path.suffix.lower() == ".npz":
-        with open_npz(path) as archive:  # only what is wanted is read
+        wanted = "columns of numbers or text"  # of which only those are read that are needed
+        with expected(path, wanted), open_npz(path) as archive:
             return find_columns(path, archive, mapped), []
     table, warnings = read_ros(path, *topics, renamed=bool(mapped))
     return find_columns(path, table, mapped), warnings
@@ -99,7 +101,7 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
     """A column in the units of the log; ValueError: the row of what cannot be a value."""
     if values.dtype.kind == "S":
         values = values.astype(str)
-    if values.dtype.kind == "M":
+    if values.dtype.kind in "mM":
         values = (values - values[:1]) / np.timedelta64(1, "s")
     elif name == "time" and values.dtype.kind in "US" and ":" in values[0]:
         moments = numbers(path, name, values, _moment, "an ISO stamp")
@@ -111,7 +113,7 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
         values = values - values[:1]  # keeps its digits
     result: Array = np.asarray(values * factor, float)
     command = name.startswith("u_")
-    limit = 1.0 if command else LARGEST
+    limit = 1.0 if command else LATEST if name == "time" else LARGEST
     unread = np.isnan(result) & name.startswith("q_")
     require(not unread.size or not unread.all(), f"column {name}", "numbers", "nan in all rows")
     for row in np.flatnonzero(~(np.abs(result) <= limit) & ~unread):  # also where it is nan

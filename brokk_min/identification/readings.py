@@ -97,7 +97,8 @@ def check_run(
     slow = [name for name, dt in zip(joints, period, strict=True) if dt > 1.05 / rate]
     units = {"ms": 1e3, "us": 1e6, "ns": 1e9}
     fits = [unit for unit, of in units.items() if 1.05 / rate > period.max() / of > 1e-4]
-    doubt = f" (if in {fits[0]}: --map time=COLUMN:{fits[0]})" if fits else ""
+    other = fits and np.median(step) > 1.05 / rate  # the rows are too slow, not the angles alone
+    doubt = f" (if in {fits[0]}: --map time=COLUMN:{fits[0]})" if other else ""
     wanted = f"new angles at the machine's {rate:g} Hz or more{doubt}"
     sensors = f"q of {brief(slow)}, one every {rows.max():g} rows"
     where = sensors if rows.max() > 1 else "column time"

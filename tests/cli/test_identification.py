@@ -195,6 +195,24 @@ def test_collect__records_what_read_log_reads(tmp_path):
     assert not np.array_equal(logs[0].recordings[0].u, logs[1].recordings[0].u)
 
 
+def test_logs__may_have_more_joints_than_the_machine(tmp_path, capsys):
+    rail = tmp_path / "rail.py"
+    rail.write_text(
+        "from dataclasses import replace\nfrom brokk_min.machine import BROKK_170\n"
+        "joints = {'joints': BROKK_170.joints[2:], 'q_start': (0.6, 1.7, 1.2)}\n"
+        "TWO = replace(BROKK_170, name='two', **joints)\n"
+    )
+    log = steady_log(tmp_path / "log.csv", (*MIXED, "track"))
+    assert run("inspect", log, "--machine", f"{rail}:TWO") == 0
+    told = capsys.readouterr().out
+    assert f"{log}: joints: expected those of --machine, left out ['q2', 'q1', 'track']" in told
+    assert 'Joint("q4"' in told and 'Joint("q1"' not in told
+    few = steady_log(tmp_path / "few.csv", ("q3", "track"))
+    assert run("inspect", few, "--machine", f"{rail}:TWO") == 1
+    wanted = "few.csv: joints: expected ['q3', 'q4', 'q5'], got ['q3', 'track']"
+    assert wanted in capsys.readouterr().err
+
+
 def test_inspect__reads_drives_and_tables_together(tmp_path, capsys):
     world = World(ConstantCommand(0, 0, 0, 0, 60), HoldingOperator(), log=tmp_path / "drive.log")
     world.drive.begin()

@@ -145,6 +145,8 @@ VIRTUAL = "drive --interface virtual --channel v"
         ("collect --out x.csv --machine digger", 2, "--machine: expected brokk170 or FILE.py"),
         ("inspect", 2, "LOGS: expected one file or more, each once, got none"),
         ("inspect drive.log --map q1=boom:deg", 2, "--map: expected a table or a recording"),
+        ("inspect l.csv --map boom=q_boom:rad", 2, "--map: expected NAME=COLUMN or NAME=COLUMN:U"),
+        ("machine --interface virtual --channel 0 --fault bad", 2, "--fault: expected [NAME:]KIND"),
         ("fit missing.csv --out n.npz", 1, "missing.csv: no such file or directory"),
         ("fit l.csv --out n.npz --no-valve --members 3", 2, "--members: expected 1 of nets"),
         ("fit l.csv --out n.txt", 2, "--out: expected a name in .npz, got n.txt"),

@@ -75,6 +75,10 @@ def test_load_table__has_renamed_joints_under_their_new_names_alone(tmp_path):
     assert table.keys() == {"run", "time", "u_a", "q_a"}
     with pytest.raises(ValueError, match="column q_left: expected numbers, got nan in all rows"):
         load_table(tmp_path / "l.npz", {})
+    rows |= {"q_left": np.ones(3), "run": np.array(["a"] * 3, object)}  # as pandas has it
+    np.savez(tmp_path / "l.npz", **rows)
+    with pytest.raises(ValueError, match=r"l.npz: expected columns of numbers or text, got Object"):
+        load_table(tmp_path / "l.npz", {})
 
 
 @pytest.mark.parametrize("run", [np.array([3, 3, 3]), np.array([b"3"] * 3), np.array(3), None])
@@ -87,3 +91,5 @@ def test_load_table__takes_numbers_as_names_and_datetimes_as_time(tmp_path, run)
     assert table["run"].tolist() == ["3"] * 3
     np.testing.assert_allclose(table["time"], [0, 0.05, 0.1])
     np.testing.assert_array_equal(table["q_a"], [0, 1, 2])
+    np.savez(tmp_path / "d.npz", **columns | {"time": np.arange(3) * tick})  # differences of times
+    np.testing.assert_allclose(load_table(tmp_path / "d.npz", {})[0]["time"], [0, 0.05, 0.1])

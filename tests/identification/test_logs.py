@@ -192,7 +192,7 @@ def test_read_log__refuses_a_sensor_that_is_slower_than_the_rows(tmp_path, every
     """Only the moving joint's values repeat; a parked joint repeats its value anyway."""
     columns = swinging()
     columns["q_a"] = columns["q_a"][np.arange(400) // every * every]
-    wanted, got = "expected new angles at the machine's 20 Hz.*", f"got {20 / every:.3g} Hz"
+    wanted, got = "expected new angles at the machine's 20 Hz or more", f"got {20 / every:.3g} Hz"
     with pytest.raises(ValueError, match=rf"q of \['a'\], one every {every} rows: {wanted}, {got}"):
         read_columns(tmp_path, columns)
     fast = swinging(rate=20.0 * every)
