@@ -124,7 +124,7 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         raw = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # each interface has its own
         raise ValueError(f"{where}, got {brief(error)}") from error
-    log = Path(log) if log else None
+    log = Path(log).resolve() if log else None  # not a link to it
     older = log.with_name(f".{log.name}.{os.getpid()}") if log and log.is_file() else None
     try:
         if log and older:
@@ -132,6 +132,8 @@ def open_bus(interface: str, channel: str, log: Path | None = None) -> Iterator[
         bus = Bus(raw, channel, log, echo=interface == "udp_multicast")
     except OSError:  # the log cannot be written
         raw.shutdown()
+        if log and older and older.exists():
+            os.replace(older, log)
         raise
     with suppress(NotImplementedError):  # python-can's word for a bus without a descriptor
         bus.file = raw.fileno()

@@ -30,7 +30,7 @@ TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 8640
 TABLES = (".csv", ".npz", ".mcap", ".db3", ".bag")  # beside folders of ROS
 TOPICS = ("/joint_states", "/commands")  # of ROS: angles and commands
 LARGEST = 1e12  # of numbers in a log, assumed: any angle or velocity
-LATEST = 1e20  # of time, which may be nanoseconds since 1970
+LAST_TIME = 1e20  # of a log, in any unit, which may be nanoseconds since 1970
 Mapped = dict[str, tuple[str, float]]  # column of the log: that of the file, and its factor
 
 
@@ -113,7 +113,7 @@ def _numbers(path: Path, name: str, values: Any, factor: float) -> Array:
         values = values - values[:1]  # keeps its digits
     result: Array = np.asarray(values * factor, float)
     command = name.startswith("u_")
-    limit = 1.0 if command else LATEST if name == "time" else LARGEST
+    limit = 1.0 if command else LAST_TIME if name == "time" else LARGEST
     unread = np.isnan(result) & name.startswith("q_")
     require(not unread.size or not unread.all(), f"column {name}", "numbers", "nan in all rows")
     for row in np.flatnonzero(~(np.abs(result) <= limit) & ~unread):  # also where it is nan

@@ -34,7 +34,7 @@ from brokk_min.machine import Array, Machine
 
 # Bounds, all assumed.
 AGAINST = 0.4  # least correlation with the other sign of what is expected
-PAUSE = 20.0  # s, of a longer one the middle is no driving
+AROUND = 20.0  # s around a command, in which a joint is driven
 CLEAR_SIGN = 0.1  # least correlation that has a clear sign
 OPPOSITE = 0.2  # the same of one recording; of sound ones of ours down to -0.11
 FASTEST = 0.999  # quantile of the speeds, because the single ones have noise
@@ -121,7 +121,7 @@ def inspect_joint(log: Log, recordings: list[Recording], j: int, zones: Pair | N
     }
     other = max(by, key=lambda name: by[name], default="")
     driven = sum(
-        (maximum_filter1d(np.abs(one.u[:, j]), round(PAUSE * rate)) > COMMANDED).sum()
+        (maximum_filter1d(np.abs(one.u[:, j]), round(AROUND * rate)) > COMMANDED).sum()
         for one in recordings
         if np.ptp(one.u[:, j]) > COMMANDED
     )

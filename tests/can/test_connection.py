@@ -81,6 +81,14 @@ def test_open_bus__replaces_an_older_log_only_if_somebody_was_heard(tmp_path, he
     assert [*tmp_path.iterdir()] == [log]
 
 
+def test_open_bus__keeps_an_older_log_if_a_new_one_cannot_be_written(tmp_path, monkeypatch):
+    (log := tmp_path / "run.log").write_text("an hour of driving")
+    monkeypatch.setattr(can, "CanutilsLogWriter", raises(OSError("too many open files")))
+    with pytest.raises(OSError, match="too many"), open_bus("virtual", "v", log):
+        raise AssertionError("a bus without its log")
+    assert log.read_text() == "an hour of driving" and [*tmp_path.iterdir()] == [log]
+
+
 def test_recv__waits_for_the_descriptor_by_its_own_clock():
     """A frame comes with the byte of a pipe."""
     reader, writer = os.pipe()

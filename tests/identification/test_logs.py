@@ -176,6 +176,14 @@ def test_read_log__guesses_the_unit_of_angles(tmp_path, scale, unit):
         read_columns(tmp_path, columns)
 
 
+@pytest.mark.parametrize(("unit", "of"), [("ms", 1e3), ("ns", 1e9)])
+def test_read_log__knows_the_unit_of_time_since_1970(tmp_path, unit, of):
+    columns = swinging()
+    columns["time"] = of * (1.7e9 + columns["time"])
+    with pytest.raises(ValueError, match=rf"\(if in {unit}: --map time=COLUMN:{unit}\)"):
+        read_columns(tmp_path, columns)
+
+
 @pytest.mark.parametrize("change", [0.6, -2 * np.pi])
 def test_read_log__cuts_where_the_zero_of_an_angle_changes(tmp_path, change):
     columns = swinging()
